@@ -12,15 +12,14 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.path import CostatePath, sample_goal
 from avsreplay.plan.reachable_set import (
-    _NODES,
-    _WEIGHTS,
+    SMALL_TURN,
     Gauge,
     gauge,
     integrals,
     newton_step,
     support,
 )
-from avsreplay.plan.rendezvous import PlanParams, _Margin, rendezvous
+from avsreplay.plan.rendezvous import Margin, PlanParams, rendezvous
 from avsreplay.records import Belief, State
 
 ORIGIN = np.zeros(3)
@@ -250,14 +249,23 @@ def test_a_goal_without_relative_acceleration_does_not_divide_by_zero() -> None:
         lambda t: (np.zeros((len(t), 3)),) * 2, np.ones(3), np.zeros(3), 0.0, 0.0, 10.0, 1.0
     )
     found = Gauge(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, 0.0)
-    reached = _Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
+    reached = Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
     assert 0.0 < reached <= goal.end
 
 
-def test_the_gauss_nodes_are_those_of_the_legendre_polynomial():
-    nodes, weights = np.polynomial.legendre.leggauss(len(_NODES))
-    assert np.allclose(_NODES, nodes, rtol=0.0, atol=1e-15)
-    assert np.allclose(_WEIGHTS, weights, rtol=0.0, atol=1e-15)
+def test_the_integrals_of_a_direction_that_hardly_changes_are_exact_to_rounding():
+    """Where the closed form loses digits, Gauss-Legendre nodes take its place."""
+    rng = np.random.default_rng(3)
+    for k in range(200):
+        P0, turn = rng.normal(size=3), rng.normal(size=3)
+        size = 0.4 * SMALL_TURN * np.linalg.norm(P0) * 10.0 ** -(k % 5)
+        P1 = P0 + size * turn / np.linalg.norm(turn)
+        once, twice = integrals(P0[None], P1[None])
+        s, w = 0.5 * (GAUSS[0] + 1.0), 0.5 * GAUSS[1]
+        path = (1.0 - s)[:, None] * P0 + s[:, None] * P1
+        unit = path / np.linalg.norm(path, axis=1)[:, None]
+        assert np.allclose(once[0], w @ unit, rtol=0.0, atol=2e-15)
+        assert np.allclose(twice[0], (w * (1.0 - s)) @ unit, rtol=0.0, atol=2e-15)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])

@@ -56,21 +56,27 @@ def fits(model: Surface, noise: float, seeds: range) -> list[tuple[SizeError, fl
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_step_of_the_extension_is_that_of_the_rows(monkeypatch, known: bool) -> None:
-    monkeypatch.setattr(size_module, "SMALL_STEP", np.inf)
+def test_the_step_of_the_extension_is_that_of_the_rows(known: bool) -> None:
     model = boxes()
     index = SurfaceIndex.build(model, 0.15 * model.extent)
     points, T_ac = scan_of(model, 4, 0.002)
     p, camera_c = 1.02 * T_ac.inverse().apply(points[::4]), T_ac.inverse().t if known else None
     rows, d, centre = size_module.least_squares(index, p, camera_c)
-    delta, moved = size_module.joined(0.0, Pose.identity(), rows.delta, d, centre)
-    other, step = size_module._rounds(index, p, camera_c, 1)
-    assert other == pytest.approx(delta, abs=1e-12)
-    np.testing.assert_allclose(step.matrix, moved.matrix, atol=1e-11)
+    rule = (
+        size_module.USED_OF_EXTENT * index.extent_m,
+        size_module.LEAST_RESIDUALS,
+        size_module.NORMAL_QUANTILE,
+        size_module.CAUCHY,
+        size_module.LEAST_INFORMATION,
+    )
+    delta, of_pose, about = index.size_step(p, camera_c, *rule)
+    assert delta == pytest.approx(rows.delta, abs=1e-12)
+    np.testing.assert_allclose(of_pose, d, atol=1e-11)
+    np.testing.assert_allclose(about, centre, atol=1e-11)
     assert abs(delta) > 0.01
     far = p + 10.0 * model.extent
     assert (
-        size_module._rounds(index, far, camera_c, 1)
+        index.size_step(far, camera_c, *rule)
         is size_module.least_squares(index, far, camera_c)
         is None
     )
