@@ -244,6 +244,15 @@ class Setup:
         t = self.task.tolerance
         return np.array([t.position_m, t.speed_mps, t.angle_deg])
 
+    def touched(self, path: Array) -> bool | None:
+        """Return whether the end-effector touches the body outside the grasp; None where contact is
+        not checked.
+
+        Args:
+            path: (n, 3) from the grasp point in {C} [m], in the order of time.
+        """
+        return None if self.contact is None else bool(self.contact.touched(path[None])[0])
+
     def at_s(self, t_ns: int) -> float:
         """Return an instant in seconds after the first scan.
 
@@ -471,7 +480,7 @@ def _continued(
     before = np.zeros(len(flown), bool) if touched is None else np.resize(touched, len(flown))
     start_s = setup.at_s(belief.t_ns)
     ends = [start_s + each.at_s for each in flown]
-    hits = [each.touched or bool(hit) for each, hit in zip(flown, before, strict=True)]
+    hits = [bool(hit or setup.touched(each.path)) for each, hit in zip(flown, before, strict=True)]
     why = [_why_not(setup, *each) for each in zip(flown, ends, hits, strict=True)]
     found = _probability(np.array([not reason for reason in why]))
     reasons = Counter(reason for reason in why if reason).most_common(1)
@@ -520,6 +529,9 @@ def simulated(
         log: the flight so far, whose scans give interval and blackouts.
         state: the state of guidance at the belief; None if the robot is at its start.
         belief: the belief from which the targets are drawn.
+
+    Returns:
+        The ends of the flights, whose paths begin with that which was flown over the log.
     """
     rng = setup.rng(3)
     _, drawn = drawn_beliefs(belief, setup.flights, rng)
@@ -527,91 +539,16 @@ def simulated(
     if setup.contact is not None and state is not None:
         estimated = np.zeros((1, 6))
         before = _flown_past(setup, setup.contact, log, belief.t_ns, estimated)[0]
-    out: list[Ended] = []
+    out, thrust = list[Ended](), Disturbance(setup.thrust_noise_mps2, rng)
     for each in drawn:
-        target = DrawnTarget(simulating(setup, log, belief), each, rng)
-        out.append(
-            closed_loop(
-                setup.guidance,
-                measured(setup, log, belief, target, state, rng),
-                target.scene,
-                belief.t_ns,
-                setup.thrust_noise_mps2,
-                rng,
-                setup.contact,
-                state,
-                before,
-            )
-        )
+        target = Scene(setup.estimator.motion(each), setup.estimator.attitude(each))
+        known = measured(setup, log, belief, target, state, rng)
+        ended = closed_loop(setup.guidance, known, target, belief.t_ns, thrust, state)
+        out.append(replace(ended, path=np.concatenate([before, ended.path])))
     return out
 
 
-class DrawnTarget:
-    """A target that begins with the mean of a belief and moves under the random torque and force
-    of an estimator, which are drawn for one interval after the other.
-
-    Attributes:
-        estimator: predicts the motion, with its process noise.
-        scene: the target, by the time after its begin [s]; after the last interval it moves freely.
-    """
-
-    def __init__(self, estimator: Estimator, drawn: Belief, rng: np.random.Generator) -> None:
-        """Begin at an instant.
-
-        Args:
-            estimator: predicts the motion.
-            drawn: mean at the begin, about the grasp point in {A}.
-            rng: random generator.
-        """
-        self.estimator, self._rng = estimator, rng
-        self._begins = [_exact(drawn)]
-        self.scene = Scene(self._goal, self._attitude)
-
-    def advance(self, t_ns: int) -> tuple[Array, Array]:
-        """Move to the end of an interval.
-
-        Args:
-            t_ns: end of the interval [ns].
-
-        Returns:
-            Position (3,) of the grasp point in {A} [m] and attitude q_ac (4,) then.
-        """
-        last, estimator = self._begins[-1], self.estimator
-        predicted = estimator.predict(estimator.resumed(last), t_ns).belief
-        there = estimator.frame.belief_out(predicted)
-        self._begins.append(_exact(drawn_beliefs(there, 1, self._rng)[1][0]))
-        at = np.array([(t_ns - self._begins[0].t_ns) * 1e-9])
-        return self._goal(at)[0][0], self._attitude(at)[0]
-
-    def _goal(self, times: Array) -> tuple[Array, Array]:
-        position, velocity = np.empty((2, len(times), 3))
-        for belief, which, after in self._parts(times):
-            position[which], velocity[which] = self.estimator.motion(belief)(after)
-        return position, velocity
-
-    def _attitude(self, times: Array) -> Array:
-        out = np.empty((len(times), 4))
-        for belief, which, after in self._parts(times):
-            out[which] = self.estimator.attitude(belief)(after)
-        return out
-
-    def _parts(self, times: Array) -> Iterator[tuple[Belief, Flags, Array]]:
-        """Intervals with the instants in them and the times of these after their begin [s]."""
-        begins = np.array([(b.t_ns - self._begins[0].t_ns) * 1e-9 for b in self._begins])
-        intervals = np.maximum(np.searchsorted(begins, times, "right") - 1, 0)
-        for k in np.unique(intervals):
-            which = intervals == k
-            yield self._begins[k], which, times[which] - begins[k]
-
-
-def _exact(belief: Belief) -> Belief:
-    """A belief without errors."""
-    if isinstance(belief, DrivenBelief):
-        belief = replace(belief, cross=0.0 * belief.cross, P_u=0.0 * belief.P_u)
-    return replace(belief, P=0.0 * belief.P)
-
-
-def simulating(setup: Setup, log: FlightLog, belief: Belief) -> Estimator:
+def _simulating(setup: Setup, log: FlightLog, belief: Belief) -> Estimator:
     """Return the estimator of simulated flights, with the disturbances of the log.
 
     The noise is known here, and a fit to the poses of the flight would have none of the log.
@@ -637,7 +574,7 @@ def measured(
     setup: Setup,
     log: FlightLog,
     belief: Belief,
-    target: DrawnTarget,
+    target: Scene,
     state: GuidanceState | None,
     rng: np.random.Generator,
 ) -> Generator[PlannerInput, GuidanceState, None]:
@@ -649,11 +586,12 @@ def measured(
         setup: task, estimator, guidance and target.
         log: the flight so far.
         belief: the belief from which the filter goes on.
-        target: the target.
+        target: the target, with its attitude, by the time after the belief [s].
         state: the state of guidance at the belief; None if the robot is at its start.
         rng: random generator.
     """
-    estimator, held = target.estimator, log.convergence
+    assert target.attitude is not None
+    estimator, held = _simulating(setup, log, belief), log.convergence
     track, C = estimator.resumed(belief), log.noise
     if C is None:  # no pose was measured
         position, half = np.split(np.diag(estimator.params.R0), 2)
@@ -667,8 +605,9 @@ def measured(
         t_ns = belief.t_ns + since_ns
         prior, gamma = estimator.predict(track, t_ns), log.gammas[(offset + k) % len(log.gammas)]
         turn, move = np.split(root @ rng.standard_normal(6), 2)
-        position, q = target.advance(t_ns)
         if gamma:
+            at = np.array([since_ns * 1e-9])
+            (position,), (q,) = target.goal(at)[0], target.attitude(at)
             pose = Pose(
                 geometry.multiply(q, geometry.exp(turn)), position + geometry.matrix(q) @ move
             )
@@ -788,15 +727,12 @@ def _in_fact(setup: Setup, log: FlightLog, state: GuidanceState, truth: Motion) 
 
 def _touched_in_fact(setup: Setup, log: FlightLog, end_ns: int, truth: Motion) -> bool | None:
     """Whether the flown path touched the true target; None where this is not known."""
-    if setup.contact is None:
-        return None
     target = true_scene(truth)
     parts = [
         relative_path(target, leg.segment, setup.since_ns, begin_ns, stop_ns)
         for leg, begin_ns, stop_ns in _flown(log, end_ns)
     ]
-    y = np.concatenate([np.zeros((0, 3)), *parts])
-    return bool(setup.contact.touched(y[None])[0])
+    return setup.touched(np.concatenate([np.zeros((0, 3)), *parts]))
 
 
 def _probability(good: Any) -> dict[str, Any]:

@@ -312,7 +312,7 @@ class Replanning:
                 due_s = t_s + period_s
         return out
 
-    def flights(self, index: int, count: int, seed: int) -> list[Ended]:
+    def flights(self, index: int, count: int, seed: int) -> list[tuple[Ended, bool]]:
         """Fly approaches with replanning, measured scans, thrust errors and delay against draws
         from a belief.
 
@@ -320,10 +320,15 @@ class Replanning:
             index: scan at which the approach begins.
             count: number of flights.
             seed: of draws and errors.
+
+        Returns:
+            The end of each flight, and whether the end-effector touched the body outside the grasp.
         """
         log, _ = self._flown()
         log.convergence, log.errors = self._known(self.saved.rows[index])
-        return simulated(self._setup(count, seed), log, None, self.belief(index))
+        setup = self._setup(count, seed)
+        flown = simulated(setup, log, None, self.belief(index))
+        return [(each, bool(setup.touched(each.path))) for each in flown]
 
     def recorded(self) -> tuple[Assessment | None, tuple[Decided, ...]]:
         """Return the assessment of the run, None where the result has none, and the changes of the

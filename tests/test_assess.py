@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from avsreplay.assess import (
-    DrawnTarget,
     FlightLog,
     ScanErrors,
     Setup,
@@ -21,7 +20,6 @@ from avsreplay.assess import (
     drawn_beliefs,
     measured,
     simulated,
-    simulating,
 )
 from avsreplay.assessment import Assessment, Chance, InFact, chance_of
 from avsreplay.build import target_geometry
@@ -29,13 +27,14 @@ from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.grasp_point import at_grasp
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.geometry import angle_between, covariance_about, exp, matrix
+from avsreplay.geometry import covariance_about, exp, matrix
 from avsreplay.log import SourceOptions
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, ConvergenceTrack
 from avsreplay.outcome import CaptureError
 from avsreplay.pipeline import planner_input
 from avsreplay.plan.contact import Contact
 from avsreplay.plan.guidance import Guidance
+from avsreplay.plan.limits import Scene
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
@@ -331,8 +330,8 @@ def after_two_scans(given, torque):
 def flown_inputs(given, torque, count):
     """What guidance is told in a simulated flight at rest."""
     setup, log, last = after_two_scans(given, torque)
+    target = Scene(setup.estimator.motion(last), setup.estimator.attitude(last))
     rng = np.random.default_rng(1)
-    target = DrawnTarget(simulating(setup, log, last), last, rng)
     return list(islice(measured(setup, log, last, target, None, rng), count))
 
 
@@ -344,25 +343,6 @@ def test_simulated_flights_have_the_random_torques_of_the_log():
         for torque in (0.0, 1e-3)
     ]
     assert told[1] > told[0] + 1e-3
-
-
-def test_a_drawn_target_moves_under_the_random_torque_as_its_forecast_says():
-    setup, log, last = after_two_scans(replace(belief()[0], P=1e-16 * np.eye(20)), 1e-3)
-    estimator, ends = simulating(setup, log, last), np.arange(1, 26) * 400_000_000
-    expected = float(estimator.forecast(last, np.array([10.0])).rot_1s_rad[-1])
-    free = estimator.attitude(last)(np.array([10.0]))[0]
-    turns = []
-    for seed in range(60):
-        target = DrawnTarget(estimator, last, np.random.default_rng(seed))
-        for end_ns in ends.tolist():
-            position, q = target.advance(last.t_ns + end_ns)
-        turns.append(angle_between(q, free))
-    assert np.sqrt(np.mean(np.square(turns))) == pytest.approx(expected, rel=0.2)
-    times = np.array([0.1, 0.3, 4.1, 4.3, 10.0])  # within two intervals, and at the end
-    assert target.scene.goal(times)[0][-1] == pytest.approx(position)
-    assert target.scene.attitude(times)[-1] == pytest.approx(q)
-    assert target.scene.attitude(times[:2]) == pytest.approx(estimator.attitude(last)(times[:2]))
-    assert target.scene.attitude(times[2:4]) != pytest.approx(estimator.attitude(last)(times[2:4]))
 
 
 def test_convergence_is_lost_in_a_simulated_flight_as_in_that_of_a_log():

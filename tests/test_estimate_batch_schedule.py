@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
-from avsreplay.estimate.batch_schedule import _bent
+from avsreplay.estimate.batch_schedule import bent
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import (
@@ -356,7 +356,7 @@ def test_a_fit_uses_a_bounded_number_of_poses() -> None:
     innovation = estimator.innovate(
         prediction, tumbling.alignment(states[1024].T_ac, np.random.default_rng(0), 0.002, 0.002)
     )
-    after, _ = estimator.batch._with(track, prediction, innovation)
+    after = estimator.batch.filtered(track, prediction, innovation).fixes
     assert len(after) <= 0.76 * batch_schedule.MOST_FIXES
     assert pose_count(after) == batch_schedule.MOST_FIXES + 1
 
@@ -398,6 +398,6 @@ def test_one_component_of_a_curved_likelihood_is_fitted_again_once_the_inertia_h
         for angle in (0.0, 1.0, 2.5):
             moved = sigmas * one_sigma @ [np.cos(angle), np.sin(angle)]
             belief = replace(fitted.belief, x=replace(x, sigma=x.sigma + moved))
-            assert _bent(curved, belief) is due
-            assert not _bent(replace(curved, gaussian=True), belief)
-            assert not _bent(replace(curved, components=curved.components * 3), belief)
+            assert bent(curved, belief) is due
+            assert not bent(replace(curved, gaussian=True), belief)
+            assert not bent(replace(curved, components=curved.components * 3), belief)

@@ -191,3 +191,19 @@ def test_a_triangular_system_is_solved_by_halves(n: int) -> None:
     A, B = rng.normal(size=(n, n)), rng.normal(size=(n, 5))
     L = np.linalg.cholesky(A @ A.T + np.eye(n))
     assert np.abs(divided(L, B) - np.linalg.solve(L, B)).max() < 1e-12
+
+
+def test_the_prior_of_a_disturbance_is_shared_by_the_densities_that_the_poses_allow() -> None:
+    """Impulses that are seen ever better, of which none is: the larger densities are excluded one
+    after the other, down to the last.
+    """
+    counts = set()
+    for information in np.logspace(-2.0, 20.0, 150):
+        found = Marginal(0.0, np.full(20, information), np.zeros(20))
+        possible = found.excluded > DENSITIES
+        counts.add(count := int(np.count_nonzero(possible)))
+        none, *each = posterior(found, 0.2)
+        odds = 0.25 / max(count, 1) * np.exp(found.log_odds)
+        np.testing.assert_allclose(np.array(each) / none, np.where(possible, odds, 0.0), rtol=1e-9)
+        assert none + sum(each) == pytest.approx(1.0)
+    assert {1, 2, len(DENSITIES)} <= counts

@@ -20,7 +20,7 @@ from avsreplay.checkpoint import pack, unpack
 from avsreplay.estimate import Estimator, _motion
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors, to_state
-from avsreplay.estimate.disturbance_schedule import _significant
+from avsreplay.estimate.disturbance_schedule import significant
 from avsreplay.estimate.drift import DrivenHypothesis, find_drift
 from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, followed
 from avsreplay.estimate.driven_fit import fit_driven, poor_fit, step_columns, without_drift
@@ -188,7 +188,7 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
     truth = surprises.world_of(case, 0)[1][-1]
     belief = result.track.belief
     assert isinstance(belief, DrivenBelief)
-    direction = surprises._direction(np.random.Generator(np.random.PCG64([0, 5])))
+    direction = tumbling.random_direction(np.random.Generator(np.random.PCG64([0, 5])))
     off = (
         np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)]) - belief.u
     )
@@ -247,12 +247,12 @@ def test_an_acceleration_is_reported_only_where_it_is_none_by_chance() -> None:
     x = surprises.world_of(surprises.Case("c", seconds=2.0), 0)[1][0]
     P_u, cross = np.zeros((6, 6)), np.zeros((20, 6))
     P_u[:3, :3] = 1e-8 * np.eye(3)
-    for size, significant in ((6.7e-5, False), (5e-4, True)):
+    for size, expected in ((6.7e-5, False), (5e-4, True)):
         u = np.append(np.full(3, size), np.zeros(3))
-        assert _significant(DrivenBelief(0, x, np.eye(20), u, P_u, cross)) is significant
+        assert significant(DrivenBelief(0, x, np.eye(20), u, P_u, cross)) is expected
     u, wide = np.full(6, 2e-4), np.diag(np.repeat([1e-8, 1e-6], 3))
-    assert _significant(DrivenBelief(0, x, np.eye(20), u, wide, cross)) is False
-    assert _significant(DrivenBelief(0, x, np.eye(20), 2.0 * u, wide, cross)) is True
+    assert significant(DrivenBelief(0, x, np.eye(20), u, wide, cross)) is False
+    assert significant(DrivenBelief(0, x, np.eye(20), 2.0 * u, wide, cross)) is True
 
 
 @pytest.mark.slow
@@ -266,7 +266,7 @@ def test_after_a_false_report_of_a_torque_the_density_of_the_random_one_is_kept(
     """
     monkeypatch.setattr("avsreplay.estimate.drift._CONSTANT", -np.inf)
     monkeypatch.setattr("avsreplay.estimate.noise_levels._ESTABLISHED", np.inf)
-    monkeypatch.setattr("avsreplay.estimate.disturbance_schedule._significant", lambda fitted: True)
+    monkeypatch.setattr("avsreplay.estimate.disturbance_schedule.significant", lambda fitted: True)
     case = surprises.Case("random", random=(1e-4, 1e-4), seconds=70.0)
     track = surprises.run(case, 2).track
     assert track is not None
@@ -282,7 +282,7 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
     fixes, truth = fixes_of(case, seed), surprises.world_of(case, seed)[1][0]
     poses, widths = poses_of(fixes), np.repeat([1e-3, 0.0], 3)
     prior = weak_prior(poses, PARAMS)
-    direction = surprises._direction(np.random.Generator(np.random.PCG64([seed, 5])))
+    direction = tumbling.random_direction(np.random.Generator(np.random.PCG64([seed, 5])))
     u = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)])
     begin = ((to_chart(truth), u), (to_chart(rough_state(fixes)), np.zeros(6)))
     true, found = (fit_jointly(poses, c, prior, np.ones(2), 0.0, a, widths) for c, a in begin)
@@ -329,7 +329,7 @@ def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
         PoseFix(round(t * 1e9), x.T_ac, np.eye(6)) for t, x in zip(times, states, strict=True)
     )
     straight = surprises.world_of(free, 5)[1]
-    direction = surprises._direction(np.random.Generator(np.random.PCG64([5, 5])))
+    direction = tumbling.random_direction(np.random.Generator(np.random.PCG64([5, 5])))
     about, u = (
         to_chart(states[0]),
         np.concatenate([geometry.matrix(states[0].q_bc).T @ (2e-4 * direction), np.zeros(3)]),

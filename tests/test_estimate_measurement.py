@@ -30,6 +30,7 @@ from avsreplay.estimate.measurement import (
     BLOCKS_OF,
     chart_update,
     gain,
+    in_fixture,
     inflated,
     innovation_of,
     innovation_vector,
@@ -162,9 +163,14 @@ def test_an_information_matrix_that_is_numerically_singular_gives_a_finite_covar
     def singular(_):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(np.linalg, "inv", singular)
+    x = some_state(4)
     v = np.array([1.0, -1.0, 0.5, 2.0, 0.0, 1.0])
-    covariance = measurement._inverse(1e20 * np.outer(v, v))
+    info = 1e20 * np.outer(v, v)  # the a-priori deviations of 1e6 are lost in rounding
+    seen = Alignment(x.T_ac, 1, True, 99, 99, 0.0, info, AlignStatus.DEGENERATE)
+    monkeypatch.setattr(np.linalg, "inv", singular)
+    R = registration_noise(seen, x, (1e6, 1e6))
+    assert R is not None
+    covariance = in_fixture(R, x.T_ac.q, x.q_bc)
     assert np.isfinite(covariance).all()
     assert v @ covariance @ v / (v @ v) == pytest.approx(1e-20 / (v @ v), rel=1e-2)
     unobservable = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])

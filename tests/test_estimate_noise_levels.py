@@ -22,9 +22,8 @@ from avsreplay.estimate.noise_levels import (
     MOST_NORMAL_POINTS,
     NO_LEVELS,
     NoiseLevels,
-    _of_positions,
-    _variances,
     estimate_levels,
+    force_likelihood,
 )
 from avsreplay.estimate.normal_points import normal_points, position_rows
 from avsreplay.estimate.params import EstimatorParams
@@ -124,7 +123,7 @@ def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(
         )
         arm, one = to_chart(world.states[0]).arm_c, np.ones(len(seen))
         rows = position_rows(poses_of(tuple(seen)), one, arm, 36, 0, [change] if step else [])
-        likelihood = _of_positions(_variances(NO_LEVELS), rows)
+        likelihood = force_likelihood(np.repeat([1.0, 0.0], [4, 2]), rows)
         found.append(np.sqrt(mean_square(likelihood)))
         excluded.append(likelihood.excluded)
     if force:

@@ -101,9 +101,9 @@ def test_a_change_between_two_scans_of_a_point_has_its_exact_effect() -> None:
     at_s, size = 1.03, 1e-6
     inside = int(np.searchsorted(window.times_s, at_s))
     assert window.points.point[inside - 1] == window.points.point[inside]
-    from avsreplay.estimate.hypotheses import _after_changes
+    from avsreplay.estimate.hypotheses import after_changes
 
-    columns = _after_changes(window, start, np.array([at_s]))[0]
+    columns = after_changes(window, start, np.array([at_s]))[0]
     x, B = propagate_state(start.x, at_s)[0], averaging(window.R, window.points.first)
     for unknown, part in enumerate([*range(W.start, W.stop), *range(VEL.start, VEL.stop)]):
         y = np.zeros((40, 6))

@@ -17,7 +17,7 @@ from avsreplay.plan.path import StepPath
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Action, Supervisor, SupervisorParams
-from avsreplay.plan.uncertainty import Tolerance
+from avsreplay.plan.uncertainty import Disturbance, Tolerance
 from avsreplay.plan.withdrawal import COAST_S
 from avsreplay.records import Forecast
 from avsreplay.simulate.target import Shape, builtin_surface
@@ -212,7 +212,8 @@ def loop(noise_mps2, seed=0, latency_s=0.0):
     target = scene(rng)
     known = (exactly(target, t) for t in np.arange(0.4, 120.0, 0.2))
     guidance = Guidance(replace(ROBOT, latency_s=latency_s), Supervisor(PARAMS))
-    return closed_loop(guidance, known, target, 0, noise_mps2, rng).outcome(Tolerance(0.02, 0.01))
+    thrust = Disturbance(noise_mps2, rng)
+    return closed_loop(guidance, known, target, 0, thrust).outcome(Tolerance(0.02, 0.01))
 
 
 def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():
@@ -236,8 +237,9 @@ def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flig
     known = [exactly(target, t) for t in np.arange(0.0, 60.0, 0.2)]
     guidance = Guidance(ROBOT, Supervisor(PARAMS), Limits(final_deg=12.0).resolved(8.0))
     grip = Contact(pin, np.array([1.0, 0.0, 0.0]), 0.0, 0.07, 0.15)
-    whole = closed_loop(guidance, (each for each in known), target, 0, contact=grip)
-    assert (whole.touched, whole.miss is not None) == (False, True)
+    whole = closed_loop(guidance, (each for each in known), target, 0)
+    assert whole.miss is not None
+    assert not grip.touched(whole.path[None])[0]
     state, path, inside = guidance.initial(0), [np.zeros((0, 3))], 0
     for last, each, rest in zip(known, known[1:], range(2, len(known)), strict=False):
         path.append(relative_path(target, state.segment, 0, last.t_ns, each.t_ns))
@@ -247,16 +249,9 @@ def test_a_flight_that_is_continued_inside_the_grasp_touches_what_the_whole_flig
         before = np.concatenate(path)
         if np.linalg.norm(before[-1]) < 0.1:
             inside += np.linalg.norm(before[-1]) < 0.075
-            flown = closed_loop(
-                guidance,
-                (each for each in known[rest:]),
-                each.scene,
-                each.t_ns,
-                contact=grip,
-                state=state,
-                before=before,
-            )
-            assert not flown.touched
+            inputs = (each for each in known[rest:])
+            flown = closed_loop(guidance, inputs, each.scene, each.t_ns, state=state)
+            assert not grip.touched(np.concatenate([before, flown.path])[None])[0]
     assert inside > 0
 
 
@@ -264,21 +259,19 @@ def test_the_errors_of_the_thrust_over_one_second_do_not_depend_on_the_rate_of_t
     path = StepPath(np.zeros(3), np.zeros(3), np.zeros((1, 3)), 0.0, 1.0)
     spreads = []
     for scans in (1, 10):
-        rng, ends = np.random.default_rng(1), []
+        thrust, ends = Disturbance(0.02, np.random.default_rng(1)), []
         for _ in range(400):
             segment = Segment(0, path.r0, path.v0, path)
             for k in range(scans):
-                segment = with_thrust_error(
-                    segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng
-                )
+                t_ns = (k + 1) * 10**9 // scans
+                segment = with_thrust_error(segment, t_ns, 1.0 / scans, thrust)
             ends.append(segment.at(10**9)[1])
         spreads.append(np.std(ends))
     assert spreads == pytest.approx(
         [0.02, 0.02], rel=0.06
     )  # m/s after 1 s; 1200 values each: 2 % is 1 sigma
-    assert (
-        with_thrust_error(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None
-    )  # a coasting robot
+    coasting = Segment(0, path.r0, path.v0)
+    assert with_thrust_error(coasting, 10**9, 1.0, thrust) is coasting
 
 
 def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
@@ -378,9 +371,9 @@ def test_errors_of_the_thrust_belong_to_the_generator_of_the_flight():
     guidance = Guidance(ROBOT, Supervisor(PARAMS))
 
     def missed_m(seed, noise_mps2=0.01):
-        rng = None if seed is None else np.random.default_rng(seed)
+        thrust = None if seed is None else Disturbance(noise_mps2, np.random.default_rng(seed))
         inputs = (each for each in known)
-        return closed_loop(guidance, inputs, target, 0, noise_mps2, rng).miss.distance_m
+        return closed_loop(guidance, inputs, target, 0, thrust).miss.distance_m
 
     assert missed_m(None) == missed_m(5, 0.0) < 1e-9
     assert missed_m(5) == missed_m(5) > 1e-4

@@ -1,6 +1,7 @@
 """The minimum-time rendezvous: its properties, and solutions computed by other methods."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,15 +13,14 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.path import CostatePath, sample_goal
 from avsreplay.plan.reachable_set import (
-    _NODES,
-    _WEIGHTS,
+    SMALL_TURN,
     Gauge,
     gauge,
     integrals,
     newton_step,
     support,
 )
-from avsreplay.plan.rendezvous import PlanParams, _Margin, rendezvous
+from avsreplay.plan.rendezvous import Margin, PlanParams, rendezvous
 from avsreplay.records import Belief, State
 
 ORIGIN = np.zeros(3)
@@ -250,14 +250,23 @@ def test_a_goal_without_relative_acceleration_does_not_divide_by_zero() -> None:
         lambda t: (np.zeros((len(t), 3)),) * 2, np.ones(3), np.zeros(3), 0.0, 0.0, 10.0, 1.0
     )
     found = Gauge(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, 0.0)
-    reached = _Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
+    reached = Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
     assert 0.0 < reached <= goal.end
 
 
-def test_the_gauss_nodes_are_those_of_the_legendre_polynomial():
-    nodes, weights = np.polynomial.legendre.leggauss(len(_NODES))
-    assert np.allclose(_NODES, nodes, rtol=0.0, atol=1e-15)
-    assert np.allclose(_WEIGHTS, weights, rtol=0.0, atol=1e-15)
+def test_the_integrals_of_a_direction_that_hardly_changes_are_exact_to_rounding():
+    """Where the closed form loses digits, Gauss-Legendre nodes take its place."""
+    rng = np.random.default_rng(3)
+    for k in range(200):
+        P0, turn = rng.normal(size=3), rng.normal(size=3)
+        size = 0.4 * SMALL_TURN * np.linalg.norm(P0) * 10.0 ** -(k % 5)
+        P1 = P0 + size * turn / np.linalg.norm(turn)
+        once, twice = integrals(P0[None], P1[None])
+        s, w = 0.5 * (GAUSS[0] + 1.0), 0.5 * GAUSS[1]
+        path = (1.0 - s)[:, None] * P0 + s[:, None] * P1
+        unit = path / np.linalg.norm(path, axis=1)[:, None]
+        assert np.allclose(once[0], w @ unit, rtol=0.0, atol=2e-15)
+        assert np.allclose(twice[0], (w * (1.0 - s)) @ unit, rtol=0.0, atol=2e-15)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
@@ -344,3 +353,32 @@ def test_a_target_whose_reach_is_nearly_tangent_to_the_thrust_is_planned_or_refu
     plan = rendezvous(lambda t: motion(t + 0.3), r0, v0, PlanParams(a_max_mps2=0.02))
     assert not plan.found or plan.lower_bound_s <= plan.t_go_s < 60.0
     assert plan.status is not PlanStatus.INFEASIBLE
+
+
+@pytest.mark.parametrize("step", [0.25, 0.5, 2.0])
+def test_the_interpolation_error_is_that_of_cubic_pieces_of_a_quartic(step):
+    """Of a position c t^4, with the constant fourth derivative 24 c, the bound is reached."""
+    c = 0.003
+    goal = sample_goal(
+        lambda t: (
+            c * np.stack([t**4, 0 * t, 0 * t], 1),
+            c * np.stack([4 * t**3, 0 * t, 0 * t], 1),
+        ),
+        ORIGIN,
+        ORIGIN,
+        0.0,
+        0.0,
+        4.0,
+        step,
+    )
+    t = np.linspace(0.0, 4.0, 4001)
+    dr, dv = np.array([goal.at(float(x))[:2] for x in t])[:, :, 0].T
+    snap = 24.0 * c
+    unit = replace(goal, snap=snap)
+    assert np.abs(dr - c * t**4).max() == pytest.approx(
+        unit.interpolation_error(1.0, 0.0, 3.0), rel=1e-3
+    )
+    assert 3.0 * np.abs(dv - 4.0 * c * t**3).max() == pytest.approx(
+        unit.interpolation_error(0.0, 1.0, 3.0), rel=1e-3
+    )
+    assert goal.snap >= 0.9 * snap

@@ -297,3 +297,9 @@ def test_recorded_poses_become_a_motion():
     assert np.isnan(motion(np.array([60.5]))[0]).all()
     with pytest.raises(ValueError, match="3 poses"):
         interpolated(times[:3], [Pose(IDENTITY_QUAT, np.zeros(3))] * 3)
+
+
+@pytest.mark.parametrize("times", [[0.0, 1.0, 1.0, 2.0], [0.0, 2.0, 1.0, 3.0], [0.0, 1.0, 2.0]])
+def test_poses_at_equal_or_descending_instants_or_fewer_than_four_are_no_motion(times) -> None:
+    with pytest.raises(ValueError, match="ascending instants"):
+        interpolated(np.array(times), [Pose.identity()] * len(times))

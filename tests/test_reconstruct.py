@@ -788,3 +788,12 @@ def test_scans_beyond_the_most_that_are_fused_are_thinned_evenly(count, left):
     assert len(chosen) == left
     assert len(set(np.diff(chosen))) <= 1
     assert list(chosen[:1]) == list(range(count)[:1])
+
+
+def test_scans_of_one_instant_have_no_free_motion() -> None:
+    """Two equal instants leave the rate between their poses unknown."""
+    t_ns = [round(0.5e9 * k) for k in range(30)]
+    poses = [Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 5.0]))] * 30
+    assert free_motion(t_ns, poses, 1.0) is not None
+    t_ns[7] = t_ns[6]
+    assert free_motion(t_ns, poses, 1.0) is None

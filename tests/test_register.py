@@ -523,3 +523,15 @@ def test_lengths_scale_with_the_model() -> None:
         == 32.0
     )
     assert RegisterParams(gate_m=0.5).limits(1.0).reach_m >= 0.5
+
+
+def test_points_of_a_single_face_lie_on_it() -> None:
+    corners = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0], [0.0, 3.0, 1.0]])
+    face = Surface(corners, np.array([[0, 1, 2]], dtype=np.int32), "face", "")
+    points, normals = sample(face, 500)
+    assert abs(len(points) - 500) <= 1
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    np.testing.assert_allclose(points[:, 2], 1.0)
+    assert (points[:, :2] >= 0.0).all()
+    assert (points[:, 0] / 2.0 + points[:, 1] / 3.0 <= 1.0 + 1e-12).all()
+    np.testing.assert_allclose(points.mean(axis=0), corners.mean(axis=0), atol=0.1)

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from avsreplay.geometry import Array
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register import index_cache
+from avsreplay.register.contract import view
 from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.near_symmetry import NearSymmetry
 from avsreplay.register.params import RegisterParams
@@ -160,9 +162,20 @@ def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
 
 
 def _searched(registrar: Registrar) -> list[bytes]:
+    """What a search uses: the motions, the marks, and their effect on poses from four sides."""
     symmetry = registrar.loop.symmetry
-    arrays = [symmetry.search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
-    return [a.tobytes() for a in arrays] + [repr((symmetry._share, symmetry._area)).encode()]
+    arrays, contradicted = [symmetry.search.symmetries, symmetry.marks, symmetry.normals], 0.0
+    about_axis = Pose(geometry.exp([0.0, 0.0, 1.0]), np.zeros(3))
+    for turn in (1.0, 2.0, 4.0, 5.0):
+        T_ac = Pose(geometry.exp([turn, 0.0, 0.0]), np.array([0.0, 0.0, 9.0]))
+        T_ca = T_ac.inverse()
+        rays = symmetry.rays(T_ac.apply(view(registrar.target.surface, 1500, T_ca.t)))
+        arrays += [each.matrix for each in symmetry.turned_poses(rays, T_ca, False)]
+        measured = symmetry.measured(rays, about_axis @ T_ca)
+        contradicted += measured.passed + measured.empty
+        arrays += [measured.distance, np.array([measured.passed, measured.empty])]
+    assert contradicted > 0.0
+    return [a.tobytes() for a in arrays] + [bytes([symmetry.near, symmetry.marked])]
 
 
 def test_what_a_search_needs_is_kept_with_the_index_and_made_again_if_damaged(

@@ -790,7 +790,9 @@ def test_input_of_the_wrong_shape_or_type_is_refused() -> None:
         model.closest(np.zeros((4, 2)))
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         model.closest(np.zeros(3))
-    index = model._index
+    faces = np.array([[0, 1, 2]], dtype=np.int32)
+    index = kernel.Index(np.eye(3), faces, np.arange(1), 0.5, 1, False)
+    assert len(index.closest(np.zeros((4, 3)), 1, None, np.inf)[0]) == 4
     with pytest.raises((ValueError, TypeError)):
         index.closest(np.zeros((4, 3), dtype=np.int64))
     with pytest.raises((ValueError, TypeError)):

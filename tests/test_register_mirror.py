@@ -35,10 +35,15 @@ DIFFERENT, SYMMETRIC = body(*MARKS), body((0.0, 0.6, -0.4))
 
 
 def checked(
-    model: Surface, target: Surface, mirrored: bool, count: int = 8, seed: int = 5
+    model: Surface,
+    target: Surface,
+    mirrored: bool,
+    count: int = 8,
+    seed: int = 5,
+    again: int = 1,
 ) -> tuple[ModelCheck, int]:
     """The check of a run, and the number of its accepted scans, which are searched without a
-    guess.
+    guess, and each given ``again`` times.
     """
     registrar, rng = Registrar(model), np.random.default_rng(seed)
     check, accepted = ModelCheck(registrar, model), 0
@@ -50,7 +55,8 @@ def checked(
         points *= [-1.0 if mirrored else 1.0, 1.0, 1.0]
         found = registrar.acquire(points)
         accepted += found.status is AlignStatus.ALIGNED
-        check.add(Scan(k, k * 10**9, points), found)
+        for n in range(again):
+            check.add(Scan(k, k * 10**9 + n, points), found)
     return check, accepted
 
 
@@ -118,8 +124,8 @@ def test_a_body_without_a_plane_of_symmetry_has_no_reflection() -> None:
 
 
 def test_scans_of_different_sides_are_kept() -> None:
-    check, _ = checked(SYMMETRIC, SYMMETRIC, mirrored=False, count=12)
-    seen = check._seen
+    check, _ = checked(SYMMETRIC, SYMMETRIC, mirrored=False, count=12, again=2)
+    seen = check.seen
     assert len(seen) == MOST_REFLECTED
     middle = 0.5 * (SYMMETRIC.vertices.min(axis=0) + SYMMETRIC.vertices.max(axis=0))
     sights = np.array(

@@ -176,7 +176,7 @@ def pot() -> trimesh.Trimesh:
 def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
     mesh, rng = pot(), np.random.default_rng(5)
     symmetry = Registrar(surface_of(mesh)).loop.symmetry
-    marks, normals = symmetry._marks, symmetry._normals
+    marks, normals = symmetry.marks, symmetry.normals
     assert len(marks) > 100
     for _ in range(6):
         q = rng.standard_normal(4)
@@ -186,7 +186,7 @@ def test_a_mark_is_visible_where_the_ray_to_it_meets_no_other_face(stride):
         open_ = ~mesh.ray.intersects_any(marks + 0.01 * towards, towards)
         steep = np.einsum("ij,ij->i", towards, normals)
         found = np.zeros(len(marks), dtype=bool)
-        found[symmetry._visible(T_ca, stride)] = True
+        found[symmetry.visible(T_ca, stride)] = True
         assert not found[np.arange(len(marks)) % stride > 0].any()
         agree = (found == (open_ & (steep > 0.25)))[::stride]
         assert agree.mean() > 0.97  # a grazing ray may differ, because the margins do

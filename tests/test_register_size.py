@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from oracles.residuals import summed
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import size as size_module
@@ -56,21 +57,27 @@ def fits(model: Surface, noise: float, seeds: range) -> list[tuple[SizeError, fl
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_step_of_the_extension_is_that_of_the_rows(monkeypatch, known: bool) -> None:
-    monkeypatch.setattr(size_module, "SMALL_STEP", np.inf)
+def test_the_step_of_the_extension_is_that_of_the_rows(known: bool) -> None:
     model = boxes()
     index = SurfaceIndex.build(model, 0.15 * model.extent)
     points, T_ac = scan_of(model, 4, 0.002)
     p, camera_c = 1.02 * T_ac.inverse().apply(points[::4]), T_ac.inverse().t if known else None
     rows, d, centre = size_module.least_squares(index, p, camera_c)
-    delta, moved = size_module.joined(0.0, Pose.identity(), rows.delta, d, centre)
-    other, step = size_module._rounds(index, p, camera_c, 1)
-    assert other == pytest.approx(delta, abs=1e-12)
-    np.testing.assert_allclose(step.matrix, moved.matrix, atol=1e-11)
+    rule = (
+        size_module.USED_OF_EXTENT * index.extent_m,
+        size_module.LEAST_RESIDUALS,
+        size_module.NORMAL_QUANTILE,
+        size_module.CAUCHY,
+        size_module.LEAST_INFORMATION,
+    )
+    delta, of_pose, about = index.size_step(p, camera_c, *rule)
+    assert delta == pytest.approx(rows.delta, abs=1e-12)
+    np.testing.assert_allclose(of_pose, d, atol=1e-11)
+    np.testing.assert_allclose(about, centre, atol=1e-11)
     assert abs(delta) > 0.01
     far = p + 10.0 * model.extent
     assert (
-        size_module._rounds(index, far, camera_c, 1)
+        index.size_step(far, camera_c, *rule)
         is size_module.least_squares(index, far, camera_c)
         is None
     )
@@ -182,3 +189,21 @@ def test_a_box_larger_than_the_model_continues_beyond_its_edges():
         found = registrar.register(*scan_of(larger, seed, 0.002))
         assert found.status is not AlignStatus.ALIGNED
         assert "continues beyond the edges" in found.message
+
+
+def test_a_step_of_size_and_pose_is_a_motion_and_then_a_scaling_about_its_centre() -> None:
+    """Points p of a target 1 + delta times as large are p / (1 + delta) in the model's size."""
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        p, centre, d = rng.normal(size=(9, 3)), rng.normal(size=3), 0.1 * rng.normal(size=6)
+        delta, step = 0.1 * rng.normal(size=2)
+        q = rng.normal(size=4)
+        moved = Pose(q / np.linalg.norm(q), rng.normal(size=3))
+        before = moved.apply(p) / (1.0 + delta)
+        larger, after = size_module.joined(delta, moved, step, d, centre)
+        turn = geometry.matrix(geometry.exp(-d[:3]))
+        there = (before - centre) @ turn.T - d[3:]
+        np.testing.assert_allclose(
+            after.apply(p) / (1.0 + larger), centre + there / (1.0 + step), atol=1e-12
+        )
+        assert 1.0 + larger == pytest.approx((1.0 + delta) * (1.0 + step))

@@ -21,6 +21,7 @@ from avsreplay.report.table import (
     decimals,
     head,
     make_console,
+    print_line,
     print_table,
     state_cell,
 )
@@ -222,3 +223,15 @@ def test_no_number_and_no_name_is_cut_at_any_width(
     for k, text in enumerate(texts):
         line = next(line for line in lines if f"name_of_a_long_metric_{k} " in line)
         assert line.split()[-2:] == [text, text]
+
+
+@pytest.mark.parametrize("width", [20, 40, 79])
+def test_text_without_a_table_keeps_to_the_width_of_the_console(width: int) -> None:
+    stream = io.StringIO()
+    print_line(make_console(stream, width=width), "The word and the number 12345 of a row. " * 6)
+    lines = stream.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert (
+        " ".join(" ".join(lines).split())
+        == ("The word and the number 12345 of a row. " * 6).strip()
+    )

@@ -238,7 +238,7 @@ class AnomalyTest:
         free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
         if free or (best.hypothesis in _USED and explained):
             return self._used(self._allowing(track, best), track.doubtful), Finding.EXPLAINED
-        if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
+        if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self.bias_began(track):
             return self._biased(track, window, best), Finding.OFFSET
         return self._by_agreement(track)
 
@@ -276,13 +276,16 @@ class AnomalyTest:
         )
         return track.changed(levels=replace(levels, count=max(levels.count, 1)))
 
-    def _bias_began(self, track: Track) -> bool:
+    def bias_began(self, track: Track) -> bool:
         """Return whether a step in the pose is the beginning of a sensor error; it may as well be
         the end of one.
 
         A range error deforms the scan, so the rms residual steps with it where the scan is
         registered. Otherwise the poses that have been consistent for longer than sensor errors
         usually last are taken as correct.
+
+        Args:
+            track: with the doubtful scans after the step, and the accepted ones before it.
         """
         before, after = (
             np.array([e.innovation.rms_m for e in epochs if e.innovation.rms_m > 0.0])

@@ -153,7 +153,7 @@ class BatchSchedule:
         then, or by its drift.
         """
         enough = track.since >= max(1.0, self._growth(last) * last.count)
-        return enough or worn(last.components) or _bent(last, track.belief)
+        return enough or worn(last.components) or bent(last, track.belief)
 
     def filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
         """The filter's posterior after a healthy pose, its noise window and its memory of poses."""
@@ -381,12 +381,16 @@ def _better_than_measured(belief: Belief, R: Array) -> bool:
     )
 
 
-def _bent(last: BatchResult, belief: Belief) -> bool:
+def bent(last: BatchResult, belief: Belief) -> bool:
     """Return whether the poses since a fit have moved the inertia by more than its 1 sigma along a
     curved likelihood.
 
     One component stands for such a likelihood where no profile fit was found. It holds near the fit
     only.
+
+    Args:
+        last: the fit.
+        belief: after the poses since.
     """
     if last.gaussian or len(last.components) > 1:
         return False

@@ -213,7 +213,7 @@ class DisturbanceSchedule:
             )
         parts = [(weight, motion.belief(epoch_ns, now_ns)) for weight, motion in driven.motions]
         fitted = driven_moments(parts)
-        if not np.isfinite(fitted.P).all() or (known is None and not _significant(fitted)):
+        if not np.isfinite(fitted.P).all() or (known is None and not significant(fitted)):
             return track
         track, best = every.changed(untested=0), driven.found.hypotheses[0]
         inflation, plain = driven.motions[0][1].inflation, driven.levels.factors(last.share)
@@ -247,9 +247,13 @@ def _overestimated(track: Track) -> bool:
     return len(track.nis) >= FEWEST and median(track.nis[-FEWEST:]) < _LEAST_NIS
 
 
-def _significant(fitted: DrivenBelief) -> bool:
+def significant(fitted: DrivenBelief) -> bool:
     """Return whether the acceleration is none by chance only, with the random disturbances that are
     found beside it.
+
+    Args:
+        fitted: the belief with the acceleration u (6,), of which components that were not estimated
+            are zero, and its covariance.
     """
     open_ = np.flatnonzero(fitted.u)
     u, P = fitted.u[open_], fitted.P_u[np.ix_(open_, open_)]

@@ -111,12 +111,12 @@ def explain(
         )
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     edges = window.edges_s
-    between = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
+    between = after_changes(window, start, 0.5 * (edges[1:] + edges[:-1]))
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), len(white), len(epochs)),
         _manoeuvre(window, start, white, free, priors),
-        _disturbed(edges, between, white, free, excluded),
-        _accelerated(
+        random_disturbance(edges, between, white, free, excluded),
+        constant_acceleration(
             edges, between, white, free, priors, isinstance(epochs[-1].track.belief, DrivenBelief)
         ),
         _sensor_bias(window, white, free, priors),
@@ -165,7 +165,7 @@ def _manoeuvre(
     n = len(lengths)
     count = _MANOEUVRE_INSTANTS
     instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
-    columns = _after_changes(window, start, instants)
+    columns = after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     single = free + mixed(columns, white, scale, _CHANGES, priors.scales)
     shares = np.repeat(
@@ -181,7 +181,7 @@ def _manoeuvre(
         if m > len(two):
             total.append(-math.inf)
             continue
-        values = free + _joint(G, g, 12 * m)
+        values = free + successive_changes(G, g, 12 * m)
         first = int(np.argmax(values))
         c = two[first : first + m].reshape(-1)
         most_likely, likely = _changes(instants[c], columns[c], white, free, scale)
@@ -201,7 +201,7 @@ def _manoeuvre(
     return replace(best, log_evidence=odds, onset=onset)
 
 
-def _disturbed(
+def random_disturbance(
     edges: Array, between: Array, white: Array, free: float, excluded: tuple[float, float]
 ) -> Explanation:
     """Random torque or force beyond what is allowed for: an impulse between every two scans.
@@ -211,8 +211,12 @@ def _disturbed(
     unlike a manoeuvre. From the densities ``excluded`` on, which the earlier poses exclude, a
     disturbance is possible only if it begins within these scans.
 
-    ``edges`` (n + 1,) are the ends of the intervals, and ``between`` (n, 6p, 6) the effects of a
-    change in each middle.
+    Args:
+        edges: (n + 1,) ends of the intervals [s].
+        between: (n, 6p, 6) whitened effects of a change of (rate, velocity) in each middle.
+        white: (6p,) whitened innovations of free motion.
+        free: log evidence of free motion.
+        excluded: root densities of torque and force.
     """
     columns, found, n = between * np.sqrt(np.diff(edges))[:, None, None], [], len(between)
     for kind, least in zip(_CHANGES[:2], (SPHERE * excluded[0], excluded[1]), strict=True):
@@ -238,14 +242,22 @@ def _disturbed(
     return max(found, key=lambda f: f.log_evidence)
 
 
-def _accelerated(
+def constant_acceleration(
     edges: Array, between: Array, white: Array, free: float, priors: ChangePriors, known: bool
 ) -> Explanation:
     """A constant torque or force: the same change of the velocity per second in every interval, as
-    in ``_disturbed``.
+    in :func:`random_disturbance`.
 
     ``size`` holds the root densities of random disturbances that cause changes as large over the
-    window. Where one is ``known`` to act, an error of its value is as likely as none.
+    window.
+
+    Args:
+        edges: (n + 1,) ends of the intervals [s].
+        between: (n, 6p, 6) whitened effects of a change of (rate, velocity) in each middle.
+        white: (6p,) whitened innovations of free motion.
+        free: log evidence of free motion.
+        priors: 1 sigma of the size of a change.
+        known: one is known to act, and an error of its value is as likely as none.
     """
     M, scale = (
         np.tensordot(np.diff(edges), between, 1),
@@ -295,7 +307,7 @@ def _located(
             break
         first, last = low, high
         instants = low + (high - low) * ((np.arange(_FINE) + 0.5) / _FINE)
-        columns = _after_changes(window, start, instants)
+        columns = after_changes(window, start, instants)
         single = free + mixed(columns, white, scale, _CHANGES, scales)
     if columns is None:
         raise AssertionError("the grid is refined at least once")
@@ -324,17 +336,21 @@ def _located(
     return replace(found, size=size, P=P, changes_s=changes), value
 
 
-def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
-    """Derivatives (k, 6p, 6) of the whitened innovations by a change of (rate, velocity) at each
-    instant (k,) [s].
+def after_changes(window: Window, start: Belief, instants: Array) -> Array:
+    """Return the derivatives (k, 6p, 6) of the whitened innovations by a change of (rate, velocity)
+    at each instant.
+
+    Args:
+        window: of the scans.
+        start: belief at its begin.
+        instants: (k,) since then [s].
     """
     which = np.searchsorted(window.times_s, instants, side="right")
     return _motion.after_changes(window.late, which, impulses(start.x, instants), instants)
 
 
-def _joint(G: Array, g: Array, size: int) -> Array:
-    """Log evidence over free motion of changes in successive intervals, two in each, as in
-    ``_changes``.
+def successive_changes(G: Array, g: Array, size: int) -> Array:
+    """Return the log evidence over free motion of changes in successive intervals, two in each.
 
     Args:
         G: (12k, 12k) normal matrix of the changes in k intervals, of unit size.

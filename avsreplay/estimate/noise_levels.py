@@ -172,7 +172,7 @@ def estimate_levels(
     found: dict[int, Marginal] = {}
     for k in (k for k in (4, 5) if open_[k]):
         if positions is not None and k == 5:
-            found[k] = _of_positions(likely, positions)
+            found[k] = force_likelihood(likely, positions)
         else:
             found[k] = _of_impulses(k - 4, likely, parts, data)
     for k, each in found.items():
@@ -195,8 +195,14 @@ def estimate_levels(
     )
 
 
-def _of_positions(theta: Array, rows: PositionRows) -> Marginal:
-    """The likelihood of a random force from positions alone."""
+def force_likelihood(theta: Array, rows: PositionRows) -> Marginal:
+    """Return the likelihood of a random force from positions alone.
+
+    Args:
+        theta: (6,) variance components: factors on the independent part of the claimed variances of
+            attitude and position, on their common part, and squared root densities, not used here.
+        rows: the positions.
+    """
     V = np.kron(np.eye(3), theta[1] * rows.white + theta[3] * rows.common)
     root = information_root(rows.info)
     return marginal(V, rows.force, Residuals(rows.e, rows.J, root, np.zeros(len(root))))

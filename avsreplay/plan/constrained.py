@@ -340,7 +340,7 @@ def _best_path(
         return found if best is None else min(best, found, key=_safest)
     away = proven(case, found, withdrawn(case, found))
     found = replace(found, escapes=away.escapes, short_m=away.short_m)
-    paths = chain((best, found), _withdrawing(case, found, drafts, near))
+    paths = chain((best, found), _unhurried(case, found, 0.0, found.t_go_s))
     return _safest_of(paths, case.reserve_m)
 
 
@@ -363,21 +363,6 @@ def _near(case: Case, free: Plan, drafts: list[StepPath]) -> list[ReferencePath]
     references = initial_references(case, free)
     references.sort(key=lambda reference: abs(reference.t - drafts[0].t_go_s))
     return references[:RETRIED]
-
-
-def _withdrawing(
-    case: Case, found: StepPath, drafts: list[StepPath], near: list[ReferencePath]
-) -> Iterator[StepPath | None]:
-    """Search paths that keep the withdrawals: from the path that was found without them, then from
-    the drafts, then from initial paths.
-    """
-    yield from _unhurried(case, found, 0.0, found.t_go_s)
-    for start in drafts[:IMPROVED]:
-        yield _refined(case, start)
-    for start in (found, *drafts[:IMPROVED]):
-        yield _refined(case, start, trust=CAREFUL)
-    for reference in near:
-        yield _converged(case, reference)
 
 
 def _unhurried(

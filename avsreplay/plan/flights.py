@@ -20,14 +20,13 @@ from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan import _cone
-from avsreplay.plan.contact import Contact
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, in_fixture_axes
 from avsreplay.plan.path import BurnPath, CostatePath, RobotPath, StepPath
 from avsreplay.plan.supervisor import Action
-from avsreplay.plan.uncertainty import Tolerance
+from avsreplay.plan.uncertainty import Disturbance, Tolerance
 
-PATH_INSTANTS = 10  # instants between two scans at which contact is checked
+PATH_INSTANTS = 10  # instants between two scans at which the flown path is known
 
 Motion = Callable[[Array], tuple[Array, Array, Array]]
 """Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4)
@@ -175,13 +174,14 @@ class Ended:
         actions: (t_s, action, rule) at every change of the supervisor's decision.
         at_s: instant at which the gripper closed, else that of the last decision.
         miss: errors when the gripper closed; None where it did not.
-        touched: whether the end-effector touched the body outside the grasp.
+        path: (n, 3) the flown path from the grasp point in {C} [m]; empty where the attitude of the
+            target is not known.
     """
 
     actions: tuple[Decided, ...]
     at_s: float
     miss: Miss | None
-    touched: bool
+    path: Array
 
     @property
     def rule(self) -> str:
@@ -219,7 +219,7 @@ def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
 
 
 def with_thrust_error(
-    segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator | None
+    segment: Segment, t_ns: int, span_s: float, thrust: Disturbance | None
 ) -> Segment:
     """Return the segment of a robot whose thrust was wrong since the last scan; a coasting robot
     has no error.
@@ -228,12 +228,11 @@ def with_thrust_error(
         segment: What the robot flies.
         t_ns: Instant of the present scan.
         span_s: Time since the last one [s], during which the error was constant.
-        sigma_mps2: 1 sigma of the error of each axis, as its mean over 1 s [m/s2].
-        rng: Random generator; None: no error.
+        thrust: The errors; None: there are none.
     """
-    if segment.path is None or rng is None or sigma_mps2 == 0.0 or span_s <= 0.0:
+    if segment.path is None or thrust is None or thrust.sigma_mps2 == 0.0 or span_s <= 0.0:
         return segment
-    u = sigma_mps2 / math.sqrt(span_s) * rng.standard_normal(3)
+    u = thrust.mean_over(span_s)
     return pushed(segment, t_ns, 0.5 * span_s * span_s * u, span_s * u)
 
 
@@ -242,11 +241,8 @@ def closed_loop(
     inputs: Generator[PlannerInput, GuidanceState, None],
     target: Scene,
     start_ns: int,
-    noise_mps2: float = 0.0,
-    rng: np.random.Generator | None = None,
-    contact: Contact | None = None,
+    thrust: Disturbance | None = None,
     state: GuidanceState | None = None,
-    before: Array | None = None,
 ) -> Ended:
     """Fly one approach with replanning, errors of the thrust and the delay of the planner.
 
@@ -256,13 +252,9 @@ def closed_loop(
             sent to it.
         target: The true target.
         start_ns: Instant from which its times count.
-        noise_mps2: 1 sigma of the acceleration error of each axis, as its mean over 1 s [m/s2]; it
-            is constant between two scans and independent from one interval to the next.
-        rng: Random generator of these errors; needed where they are not zero.
-        contact: Contact with the body; None: it is not checked.
+        thrust: Errors of the thrust, constant between two scans and independent from one interval
+            to the next; None: there are none.
         state: State of the robot at ``start_ns``; None: at its configured start.
-        before: Path (n, 3) that the robot has flown to that state, from the grasp point in {C} [m]:
-            how it came to the grasp decides whether it touches the body there.
 
     Raises:
         ValueError: There is no input.
@@ -270,12 +262,11 @@ def closed_loop(
     aimed: Array | None = None
     decisions: list[Decided] = []
     last_ns, known, state = start_ns, next(inputs, None), state or guidance.initial(start_ns)
-    flown = [np.zeros((0, 3)) if before is None else before]
+    flown = [np.zeros((0, 3))]
     while known is not None:
         span = (known.t_ns - last_ns) * 1e-9
-        if contact is not None:
-            flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
-        segment = with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng)
+        flown.append(relative_path(target, state.segment, start_ns, last_ns, known.t_ns))
+        segment = with_thrust_error(state.segment, known.t_ns, span, thrust)
         state, last_ns = guidance.step(replace(state, segment=segment), known), known.t_ns
         decision, t_s = state.decision, (known.t_ns - start_ns) * 1e-9
         decisions.append((t_s, decision.action.value, decision.rule))
@@ -286,17 +277,16 @@ def closed_loop(
         known = None if ended else _sent(inputs, state)
     if not decisions:
         raise ValueError("the log contains no scan")
-    actions, y = changes_of(decisions), np.concatenate(flown)
-    touched = contact is not None and bool(contact.touched(y[None])[0])
+    actions, path = changes_of(decisions), np.concatenate(flown)
     if state.decision.action is not Action.CAPTURE:
-        return Ended(actions, (last_ns - start_ns) * 1e-9, None, touched)
+        return Ended(actions, (last_ns - start_ns) * 1e-9, None, path)
 
     def truth(times: Array) -> tuple[Array, Array, Array]:
         turned = np.full((len(times), 4), np.nan)
         return *target.goal(times), turned if target.attitude is None else target.attitude(times)
 
     found = closed_miss(state, start_ns, truth, aimed)
-    return Ended(actions, found.at_s, found, touched)
+    return Ended(actions, found.at_s, found, path)
 
 
 def _sent(

@@ -296,7 +296,7 @@ def _search_stretch(
         tolerance = max(1e-15, 1e-2 * min(excess * excess, 1.0))
         found = gauge(dr, t * dv - dr, (found.P0, found.P1) if found else None, tolerance)
         margin = found.value - a_max * t * t  # G(t), with h(P) = 1
-        local = _Margin.of(found, t, dv, ddv, a_max)
+        local = Margin.of(found, t, dv, ddv, a_max)
         if margin <= 1e-12 * found.value:
             if tolerance <= 1e-15:
                 return _Search(local.before(goal, t), True, found, count)
@@ -333,15 +333,23 @@ def _first_bound(goal: SampledGoal, a_max: float) -> float:
 
 
 @value_class(eq=True)
-class _Margin:
-    """Local behaviour of G for one normal: n0 = |P0 - P1|, n1 = |P1|, and the slope dG/dt."""
+class Margin:
+    """Local behaviour of G for one normal (P0, P1) of the reachable set.
+
+    Attributes:
+        n0, n1: |P0 - P1| and |P1|.
+        slope: dG/dt.
+    """
 
     n0: float
     n1: float
     slope: float
 
     @classmethod
-    def of(cls, found: Gauge, t: float, dv: Array, ddv: Array, a_max: float) -> _Margin:
+    def of(cls, found: Gauge, t: float, dv: Array, ddv: Array, a_max: float) -> Margin:
+        """Return it for the normal ``found`` at t [s], where the goal has the velocity dv [m/s] and
+        the acceleration ddv [m/s^2] relative to the robot, with thrust up to a_max [m/s^2].
+        """
         across = found.P0 - found.P1
         slope = float(across @ dv + found.P1 @ (dv + t * ddv)) - 2.0 * a_max * t
         return cls(math.sqrt(float(across @ across)), math.sqrt(float(found.P1 @ found.P1)), slope)
@@ -413,7 +421,7 @@ def _polish(
         dr = rho[0] - r0 - v0 * (params.latency_s + t)
         found = gauge(dr, t * dv - dr, (found.P0, found.P1))
         margin = found.value - a_max * t * t
-        local = _Margin.of(found, t, dv, sampled.at(t)[2], a_max)
+        local = Margin.of(found, t, dv, sampled.at(t)[2], a_max)
         if abs(margin) < best[0]:
             best = (abs(margin), t, found, local.joined(sampled, t, abs(margin), search.t, a_max))
         if local.slope >= 0.0 or abs(margin) <= 1e-13 * found.value:

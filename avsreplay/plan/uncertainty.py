@@ -113,20 +113,27 @@ def _text(band: Band, scale: float, unit: str, digits: int) -> str:
 
 @value_class
 class Disturbance:
-    """Errors of the thrust: accelerations that are constant over each second, normal, independent
-    between the axes.
+    """Errors of the thrust: white noise of the acceleration, independent between the axes.
 
     Attributes:
-        sigma_mps2: 1 sigma of each axis [m/s2].
+        sigma_mps2: 1 sigma of the mean over 1 s of each axis [m/s2].
         rng: Random generator.
     """
 
     sigma_mps2: float
     rng: np.random.Generator
 
+    def mean_over(self, span_s: float) -> Array:
+        """Draw the mean (3,) over an interval [m/s2].
+
+        Args:
+            span_s: Its length [s].
+        """
+        return np.asarray(self.sigma_mps2 / math.sqrt(span_s) * self.rng.standard_normal(3))
+
     def deviation(self, times: Array) -> tuple[Array, Array]:
-        """Draw one deviation of the robot from its planned path; each call draws a new one from
-        ``rng``.
+        """Draw one deviation of the robot from its planned path, with errors that are constant over
+        each second; each call draws a new one from ``rng``.
 
         Args:
             times: (n,) ascending from 0 [s].

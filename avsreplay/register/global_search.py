@@ -188,7 +188,7 @@ class GlobalSearch:
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
         found = found if known is None else [*found, self.measured(fine, known)]
-        return self._verdict([*found, *(before.candidates if before else ())])
+        return self.verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(
         self, few: Array, scan: Array, sight: Array | None
@@ -343,7 +343,12 @@ class GlobalSearch:
         """The pose registered to the model."""
         return horn.align_within(points, T_ca, width_m, near).T_ca
 
-    def _verdict(self, found: Sequence[Measured]) -> SearchResult:
+    def verdict(self, found: Sequence[Measured]) -> SearchResult:
+        """Return which of some poses explains the scan best, and the others that are as good.
+
+        Args:
+            found: the poses, measured on the same points.
+        """
         noise = least_noise(found)
         width = max(
             self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent)

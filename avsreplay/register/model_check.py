@@ -124,7 +124,13 @@ class _Place:
 
 
 class ModelCheck:
-    """Collects scans of one run and reports errors of the model."""
+    """Collects scans of one run and reports errors of the model.
+
+    Attributes:
+        deltas: sizes of the target over that of the model, less 1, of the scans that show one.
+        durations: what the order of the points says of the duration of a scan.
+        seen: accepted scans of different sides, with which the mirror image is compared.
+    """
 
     def __init__(self, registrar: Registrar, surface: Surface) -> None:
         """Create the check of one run.
@@ -144,7 +150,7 @@ class ModelCheck:
         self._size_open = (
             True  # whether the scans so far do not exclude an error of the size to report
         )
-        self._deltas: list[float] = []
+        self.deltas: list[float] = []
         self._weights: list[float] = []
         self._points: list[
             tuple[Array, Array | None]
@@ -156,11 +162,9 @@ class ModelCheck:
         )  # scans that may give a place; one of ``_stride`` does
         self._unmatched: Scan | None = None
         self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
-        self._durations = Durations()
+        self.durations = Durations()
         self._middle = 0.5 * (surface.vertices.min(axis=0) + surface.vertices.max(axis=0))
-        self._seen: list[
-            SeenScan
-        ] = []  # accepted scans of different sides, to compare the mirror image
+        self.seen: list[SeenScan] = []
 
     def add(self, scan: Scan, found: Alignment | None) -> None:
         """Use one scan.
@@ -195,11 +199,11 @@ class ModelCheck:
             self._systematic += share
         if (
             self._aligned % CHECKED_EVERY == 1
-            and len(self._deltas) < MOST_CHECKED
+            and len(self.deltas) < MOST_CHECKED
             and self._size_open
         ):
             self._measure(scan, found.T_ac)
-        if scan.places is not None and self._durations.wanted():
+        if scan.places is not None and self.durations.wanted():
             self._measure_duration(scan, scan.places, found.T_ac)
         self._keep(scan, found.T_ac)
         self._last = scan.t_ns, found.T_ac
@@ -218,7 +222,7 @@ class ModelCheck:
         )
 
     def _of_residuals(self) -> tuple[float, float] | None:
-        if len(self._deltas) < LEAST_SCANS:
+        if len(self.deltas) < LEAST_SCANS:
             return None
         mean, spread, weight = self._mean()
         tried = np.linspace(0, len(weight) - 1, BIAS_SCANS).astype(np.intp)
@@ -271,7 +275,7 @@ class ModelCheck:
         """The weighted mean of the errors of size, its standard error (jackknife), and the limited
         weights.
         """
-        values, weight = np.array(self._deltas), np.array(self._weights)
+        values, weight = np.array(self.deltas), np.array(self._weights)
         weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
         without = (weight @ values - weight * values) / (weight.sum() - weight)
         return float(weight @ values / weight.sum()), spread_of(without), weight
@@ -281,7 +285,7 @@ class ModelCheck:
         """Whether the order of the points excludes that a scan takes a part of the period, or
         gives this part.
         """
-        durations = self._durations
+        durations = self.durations
         return not durations.open or durations.result(self._registrar.index) is not None
 
     def notes(self) -> tuple[str, ...]:
@@ -289,14 +293,14 @@ class ModelCheck:
         are none.
         """
         if self._aligned:
-            if mirror_image_fits(self._registrar, self._surface, self._seen):
+            if mirror_image_fits(self._registrar, self._surface, self.seen):
                 return (
                     (
                         "the mirror image of the model explains the scans better than the model,"
                         f" {_MIRRORED}"
                     ),
                 )
-            duration = self._durations.result(self._registrar.index)
+            duration = self.durations.result(self._registrar.index)
             if duration is None:
                 return _size_note(self.scale())
             # motion during the scans makes an error of the size appear, so that both are fitted
@@ -334,10 +338,10 @@ class ModelCheck:
         p, camera_c = self._on_model(scan, T_ac, CHECKED_POINTS), self._camera(scan, T_ac.inverse())
         measured = None if p is None else fitted_size(self._registrar.index, p, camera_c)
         if p is not None and measured is not None and measured.sigma > 0.0:
-            self._deltas.append(measured.delta)
+            self.deltas.append(measured.delta)
             self._weights.append(1.0 / measured.sigma**2)
             self._points.append((p, camera_c))
-            if len(self._deltas) >= ENOUGH_SCANS:
+            if len(self.deltas) >= ENOUGH_SCANS:
                 mean, spread, _ = self._mean()
                 self._size_open = not abs(mean) + SIZE_SIGMAS * spread < _LEAST_RUN_ERROR
 
@@ -375,19 +379,19 @@ class ModelCheck:
         kept, T_ca = _some(scan.points, _DURATION_POINTS), T_ac.inverse()
         p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
-        self._durations.add(
+        self.durations.add(
             self._registrar.index, OrderedScan(p, motion, self._camera(scan, T_ca), period)
         )
 
     def _keep(self, scan: Scan, T_ac: Pose) -> None:
         """Keep a scan of another side of the target, for the comparison with the mirror image."""
-        if not wanted(self._seen):
+        if not wanted(self.seen):
             return
         T_cs = T_ac.inverse() if scan.sensor is None else T_ac.inverse() @ scan.sensor
-        if not from_another_side(T_cs, self._seen, self._middle):
+        if not from_another_side(T_cs, self.seen, self._middle):
             return
         if (p := self._on_model(scan, T_ac, _SEEN_POINTS)) is not None:
-            self._seen.append(SeenScan(T_cs.inverse().apply(p).astype(np.float32), T_cs))
+            self.seen.append(SeenScan(T_cs.inverse().apply(p).astype(np.float32), T_cs))
 
     def _diagnosis(self, scan: Scan) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""

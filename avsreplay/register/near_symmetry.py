@@ -58,6 +58,7 @@ class NearSymmetry:
     Attributes:
         search: the global search of the same target.
         poses: says when two poses are the same.
+        marks, normals: (n, 3) points on the marks in {C} [m], and the normals of their faces.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class NearSymmetry:
         self._exact = kept["exact"]
         if "marks" not in kept:
             kept["marks"], kept["marked"] = self._found()
-        self._marks, self._normals = kept["marks"]
+        self.marks, self.normals = kept["marks"]
         self._share, self._area = (float(x) for x in kept["marked"])
 
     def _exact_ones(self) -> Array:
@@ -211,7 +212,7 @@ class NearSymmetry:
         revolution with marks has a minimum wherever a mark of the model meets some of the points.
         """
         # where all motions are compared, one mark in so many is tested
-        stride = max(1, -(-len(self._marks) // SCREENED_MARKS))
+        stride = max(1, -(-len(self.marks) // SCREENED_MARKS))
         passed = self._passed(rays, T_ca, stride)[0]
         distance = self._test.measure(rays.points, T_ca)
         kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
@@ -255,30 +256,32 @@ class NearSymmetry:
 
         Only one in ``stride`` of the marks is tested, and counts for so many.
         """
-        seen = self._visible(T_ca, stride)
+        seen = self.visible(T_ca, stride)
         if not len(seen) or rays.tree is None:
             return 0.0, 0.0
-        marks = T_ca.inverse().apply(self._marks[seen])
+        marks = T_ca.inverse().apply(self.marks[seen])
         far = np.linalg.norm(marks, axis=1)
-        cosine = -np.einsum("ij,ij->i", self._normals[seen] @ T_ca.R, marks) / far
+        cosine = -np.einsum("ij,ij->i", self.normals[seen] @ T_ca.R, marks) / far
         expected = stride * self._area * cosine / (far * rays.spacing) ** 2
         angle, nearest = (each[:, 0] for each in rays.tree.query(marks / far[:, None]))
         empty = angle > EMPTY * rays.spacing
         passed = ~empty & (rays.ranges[nearest] > far + OFF * self._gate)
         return float(expected[passed].sum()), float(expected[empty].sum())
 
-    def _visible(self, T_ca: Pose, stride: int) -> NDArray[np.intp]:
-        """One in ``stride`` of the marks, if they face the camera and no other part of the model
-        hides them.
+    def visible(self, T_ca: Pose, stride: int) -> NDArray[np.intp]:
+        """Return the numbers of the marks that face the camera and that no other part of the model
+        hides; none if the camera is unknown.
 
-        None if the camera is unknown.
+        Args:
+            T_ca: the pose.
+            stride: one in so many of the marks is tested.
         """
         if not self._target.visibility.may_be_camera(T_ca):
             return np.empty(0, dtype=np.intp)
-        away = self._marks[::stride] - T_ca.t
+        away = self.marks[::stride] - T_ca.t
         far = np.linalg.norm(away, axis=1)
         away /= far[:, None]
-        seen = np.flatnonzero(np.einsum("ij,ij->i", away, self._normals[::stride]) < -MARK_COSINE)
+        seen = np.flatnonzero(np.einsum("ij,ij->i", away, self.normals[::stride]) < -MARK_COSINE)
         first = self._target.index.cast(T_ca.t, away[seen])[0]
         return np.asarray(stride * seen[first > far[seen] - OFF * self._gate], dtype=np.intp)
 

@@ -121,12 +121,12 @@ def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, A
     )
     seed = 0 if task.log else toml_document.parse(task.scenario, "scenario").table["seed"]
     flights = planning.flights(saved.index_at(None), task.flights, seed)
-    ends = [each.outcome(planning.tolerance) for each in flights]
+    ends = [each.outcome(planning.tolerance) for each, _ in flights]
     counts = {"count": len(ends)} | {
         name: ends.count(end)
         for name, end in (("captured", "captured"), ("outside", "outside"), ("aborted", "abort"))
     }
-    counts["touched"] = sum(each.touched for each in flights)
+    counts["touched"] = sum(touched for _, touched in flights)
     shares = {f"{name}_share": counts[name] / len(ends) for name in counts if name != "count"}
     return {f"flights.{name}": value for name, value in {**counts, **shares}.items()}
 

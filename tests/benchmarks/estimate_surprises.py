@@ -180,7 +180,7 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
         x0 = replace(x0, w_b=case.speed * np.eye(3)[axis])
         return list(world.times), tumbling.follow(world.times, world.moments, x0), dv, dw
     if case.torque:
-        direction = _direction(rng)
+        direction = tumbling.random_direction(rng)
         states, x, part = [x0], x0, 10
         for _ in world.times[1:]:
             for _ in range(part):
@@ -208,7 +208,10 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
         return list(world.times), world.states, dv, dw
     at = case.at_s + LATER_S
     before = world.times[world.times <= at]
-    dv, dw = case.velocity * _direction(rng), case.rate * _direction(rng)
+    dv, dw = (
+        case.velocity * tumbling.random_direction(rng),
+        case.rate * tumbling.random_direction(rng),
+    )
     x = tumbling.follow(np.array([0.0, at]), world.moments, x0)[-1]
     pushed = replace(x, v_a=x.v_a + dv, w_b=x.w_b + dw)
     rest = world.times[len(before) :]
@@ -372,11 +375,6 @@ def inside_band(nees: Array) -> Array:
     """
     low, high = chi2.ppf([[0.025], [0.975]], NEES_DOF) / NEES_DOF
     return ((nees >= low) & (nees <= high)).mean(axis=(0, 1))
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    v = rng.normal(size=3)
-    return v / np.linalg.norm(v)
 
 
 def line(case: Case, results: list[Result]) -> str:

@@ -36,7 +36,7 @@ from avsreplay.plan.guidance import Guidance
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Supervisor, SupervisorParams
-from avsreplay.plan.uncertainty import Tolerance
+from avsreplay.plan.uncertainty import Disturbance, Tolerance
 from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
@@ -150,15 +150,11 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
         ConvergenceTrack(),
     )
     target, touched = geometry_of(state(0.0)), False
-    flown, errors, gripper, radius = (
-        PlanParams(latency_s=0.2),
-        np.random.default_rng([seed, 1]),
-        None,
-        0.0,
-    )
+    flown, gripper, radius = PlanParams(latency_s=0.2), None, 0.0
     if robot is not None:
         flown, limits, noise = robot.applied(flown), robot.limited(limits), robot.thrust_noise
         gripper, radius = robot.gripper, robot.radius_m
+    errors = Disturbance(noise * flown.a_max_mps2, np.random.default_rng([seed, 1]))
     guidance = Guidance(
         flown, Supervisor(SupervisorParams().resolved(EXTENT_M)), limits, EXTENT_M, gripper
     )
@@ -176,9 +172,7 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
         known = planner_input(
             estimator, belief, target, gamma, watch.converged, partial(estimator.forecast, belief)
         )
-        wrong = with_thrust_error(
-            memory.segment, t_ns, 1.0 / RATE_HZ, noise * flown.a_max_mps2, errors
-        )
+        wrong = with_thrust_error(memory.segment, t_ns, 1.0 / RATE_HZ, errors)
         memory = replace(memory, segment=wrong)
         before, memory = memory, guidance.step(memory, known)
         for at_s in np.linspace(t, t + 1.0 / RATE_HZ, 5):

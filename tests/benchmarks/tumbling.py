@@ -45,9 +45,12 @@ def draw(
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     moments = _moments(rng, sigma_max)
-    q_ab, w = geometry.exp(_direction(rng) * rng.uniform(0, np.pi)), _direction(rng) * rate
-    q_bc = geometry.exp(_direction(rng) * np.radians(mu_deg) * rng.uniform())
-    c = _direction(rng) * varrho * rng.uniform() ** (1 / 3)
+    q_ab, w = (
+        geometry.exp(random_direction(rng) * rng.uniform(0, np.pi)),
+        random_direction(rng) * rate,
+    )
+    q_bc = geometry.exp(random_direction(rng) * np.radians(mu_deg) * rng.uniform())
+    c = random_direction(rng) * varrho * rng.uniform() ** (1 / 3)
     r, v = np.array([0.0, 0.0, 5.0]) + rng.normal(size=3) * 0.2, rng.normal(size=3) * 0.005
     times = np.arange(0.0, seconds + 0.5 / hz, 1.0 / hz)
     return World(
@@ -135,6 +138,7 @@ def alignment(
     return Alignment(T_ac, 5, True, 4000, 3900, 0.008, np.linalg.inv(C), AlignStatus.ALIGNED, C)
 
 
-def _direction(rng: np.random.Generator) -> Array:
+def random_direction(rng: np.random.Generator) -> Array:
+    """A unit vector (3,), all directions equally likely."""
     v = rng.normal(size=3)
     return v / np.linalg.norm(v)
