@@ -422,11 +422,16 @@ def test_without_plans_poses_are_the_same_and_no_capture_is_assessed(cli, fixtur
     assert "plan.enabled" in assessment["limit"]
 
 
-def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
+@pytest.mark.slow  # it plans
+def test_a_run_that_captures_meets_a_required_verdict(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
     settings = "task.approach=free", "task.position_m=0.05", "limits.final_deg=30"
     grasp = [word for each in settings for word in ("--set", each)]
     assert cli("run", log, "--require", "pass", *grasp).code == 0  # also after the occlusion
+
+
+def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
+    log = fixtures_folder / "tumble.mcap"
     done = cli("run", log, "--n-scans", 5, "--require", "pass")  # too short to converge
     assert done.code == 1
     assert "CAPTURE not yet decided" in done.err
