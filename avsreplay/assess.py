@@ -452,7 +452,7 @@ def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
     if scene.sigma is not None:
         position, attitude = scene.sigma(np.array([max(after_s, 0.0)]))
         sigma = float(position[0]), float(attitude[0])
-    blocked = axis_blocked(scene, limits, setup.extent_m, sigma)
+    blocked = axis_blocked(scene, limits, setup.extent_m)
     if blocked is None:
         if sigma is None or not _found_without_allowance(setup, scene, belief):
             return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
