@@ -211,3 +211,14 @@ def test_other_differences_do_not_turn_the_track() -> None:
     across = np.cross(track.undetermined[:3, 0], [0.3, -0.5, 0.8])
     other = Pose(geometry.exp(0.5 * across / np.linalg.norm(across)), np.zeros(3))
     assert turned(track, x.T_ac, measured @ other, aligned(measured)) is track
+
+
+def test_a_displacement_that_no_scan_has_determined_does_not_turn_the_track() -> None:
+    """A slide along a face with a rotation of 0.06 rad per metre: taken as a rotation, its axis
+    would be 17 m away.
+    """
+    track, _, _ = symmetric_track(1)
+    x, slide = track.belief.x, np.array([0.03, 0.01, 0.0, 0.0, 0.0, 0.6])[:, None]
+    sliding = Track(track.belief, "filter", undetermined=slide)
+    measured = x.T_ac @ Pose(geometry.exp([0.05, 0.0, 0.0]), np.array([0.0, 0.0, 0.01]))
+    assert turned(sliding, x.T_ac, measured, aligned(measured)) is sliding

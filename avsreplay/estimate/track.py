@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from statistics import median
@@ -31,6 +32,9 @@ _READY_AFTER_MANOEUVRE = 3
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
+# least rotation of a motion of `common_motions` that is one of the model: its axis is within half an
+# extent of the centre, and a displacement is none [rad]
+_LEAST_ROTATION = 2.0 / math.sqrt(5.0)
 # largest change of the other rotations if a rotation that is first determined turns the track
 _TURN_WITHIN_RAD = 0.2
 _SAME_MOTION_COSINE = 0.966  # cosine of 15 deg, between motions that count as the same
@@ -238,7 +242,7 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
         alignment.status is AlignStatus.ALIGNED and alignment.free is None,
     )
     size = float(np.linalg.norm(d[:3])) if d.shape[1] == 1 and determines else 0.0
-    if size < 1e-9:
+    if size < _LEAST_ROTATION:
         return track
     axis, moment = np.split(d[:, 0] / size, 2)
     step = T_ac.inverse() @ measured
