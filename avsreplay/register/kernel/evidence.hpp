@@ -30,6 +30,8 @@ struct PatchRule {
   double noise = 0;  // [m] along the rays; above 0 points that noise moved over an edge add nothing to the patches
 };
 
+constexpr double CREDIBLE = 3;  // standard deviations beyond which a point is not one of the model with noise
+
 // Whether a measured point within a distance from a place of a face of a mesh is closest to its plane.
 bool is_clear(const Store& store, int32_t lane, const double* on, double distance);
 
@@ -73,7 +75,6 @@ class Matcher {
   }
 
  private:
-  static constexpr double CREDIBLE = 3;  // standard deviations of the noise
   static constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
   const Store& s_;
   const Code& code_;

@@ -8,7 +8,6 @@ namespace {
 
 constexpr size_t LEAST_SAMPLES = 30;
 constexpr double LEAST_COSINE = 0.2;         // of incidence, where the noise along the ray is measured
-constexpr double CREDIBLE = 3.0;             // standard deviations beyond which a point is not one of the model with noise
 constexpr double CLEAR = 3.0;                // standard deviations by which noise moves a point
 constexpr double LEAST_OF_GATE = 1e-6;       // smaller noise is that of an exact scan
 constexpr size_t CAST = 300;                 // rays that are cast to measure the noise, about
