@@ -32,8 +32,8 @@ _READY_AFTER_MANOEUVRE = 3
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
-# least rotation of a motion of `common_motions` that is one of the model: its axis is within half an
-# extent of the centre, and a displacement is none [rad]
+# least rotation of a motion of `common_motions` that is one of the model [rad]: its axis is within
+# half an extent of the centre, and a displacement is none
 _LEAST_ROTATION = 2.0 / math.sqrt(5.0)
 # largest change of the other rotations if a rotation that is first determined turns the track
 _TURN_WITHIN_RAD = 0.2
