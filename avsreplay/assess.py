@@ -448,15 +448,12 @@ def _prevented(setup: Setup, belief: Belief, after_s: float) -> tuple[str, str]:
     """
     limits, forecast = setup.guidance.limits, partial(setup.estimator.forecast, belief)
     scene = planner_input(setup.estimator, belief, setup.target, 1, True, forecast).scene
-    sigma = None
-    if scene.sigma is not None:
-        position, attitude = scene.sigma(np.array([max(after_s, 0.0)]))
-        sigma = float(position[0]), float(attitude[0])
     blocked = axis_blocked(scene, limits, setup.extent_m)
     if blocked is None:
-        if sigma is None or not _found_without_allowance(setup, scene, belief):
+        if scene.sigma is None or not _found_without_allowance(setup, scene, belief):
             return "", "more thrust or a longer horizon; 'avsreplay plan' names the settings"
-        cause = f"the predicted error of {1e3 * sigma[0]:.3g} mm takes the room to approach"
+        position_m = float(scene.sigma(np.array([max(after_s, 0.0)]))[0][0])
+        cause = f"the predicted error of {1e3 * position_m:.3g} mm takes the room to approach"
         change = "a longer observation would help, or a smaller limits.clearance_sigmas"
         return f": {cause}", change
     name, until_m, short_m = blocked

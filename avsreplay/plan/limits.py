@@ -289,9 +289,7 @@ def required_clearance(limits: Limits, distance: Array, sigma: tuple[Array, Arra
     return clearance
 
 
-def axis_blocked(
-    scene: Scene, limits: Limits, length_m: float, sigma: tuple[float, float] | None = None
-) -> tuple[str, float, float] | None:
+def axis_blocked(scene: Scene, limits: Limits, length_m: float) -> tuple[str, float, float] | None:
     """Return why no straight approach along the fixture's axis exists: the constraint that is
     violated there, the distance from the grasp point up to which it is [m], and the largest
     violation [m]; None where all hold.
@@ -300,14 +298,12 @@ def axis_blocked(
         scene: The target.
         limits: Resolved limits.
         length_m: Length of the axis that is looked at [m].
-        sigma: Predicted 1 sigma of position [m] and attitude [rad] at the capture; None: exact.
     """
     if scene.axis_c is None or not limits.geometric:
         return None
     along = np.linspace(0.0, length_m, AXIS_POINTS)
-    away = None if sigma is None else (along * 0.0 + sigma[0], along * 0.0 + sigma[1])
     y = along[:, None] * scene.axis_c
-    found = margins(scene, replace(limits, reach_max_m=None, reach_min_m=None), y, y, away).values
+    found = margins(scene, replace(limits, reach_max_m=None, reach_min_m=None), y, y).values
     worst = int(found[1:].min(axis=0).argmin())
     violated = np.flatnonzero(found[1:, worst] < 0.0)
     if not len(violated):
