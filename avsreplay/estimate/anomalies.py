@@ -207,8 +207,7 @@ class AnomalyTest:
             return self._manoeuvred(reported, window, best), Finding.EXPLAINED
         if best.hypothesis is not Hypothesis.FREE_MOTION:
             return biased
-        before = with_history(bias.since[0].track, track).changed(recent=track.recent)
-        return self._used(before, bias.since), Finding.EXPLAINED
+        return self._used(self._allowing(track, bias.since, best), bias.since), Finding.EXPLAINED
 
     def _undecidable(self, track: Track) -> tuple[Track, Finding]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones
@@ -237,7 +236,8 @@ class AnomalyTest:
             return in_doubt
         free = best.hypothesis is Hypothesis.FREE_MOTION or (manoeuvre and not best.changes)
         if free or (best.hypothesis in _USED and explained):
-            return self._used(self._allowing(track, best), track.doubtful), Finding.EXPLAINED
+            before = self._allowing(track, track.doubtful, best)
+            return self._used(before, track.doubtful), Finding.EXPLAINED
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self.bias_began(track):
             return self._biased(track, window, best), Finding.OFFSET
         return self._by_agreement(track)
@@ -256,11 +256,11 @@ class AnomalyTest:
             return self._manoeuvred(reported, window, best), Finding.EXPLAINED
         return (reported, Finding.OPEN) if waits else None
 
-    def _allowing(self, track: Track, found: Explanation) -> Track:
-        """The track before the doubtful scans with the disturbances or the noise that explain
-        them.
+    def _allowing(self, track: Track, scans: tuple[Epoch, ...], found: Explanation) -> Track:
+        """The track before scans that were not used, with the disturbances or the noise that
+        explain them.
         """
-        before = with_history(track.doubtful[0].track, track).changed(recent=track.recent)
+        before = with_history(scans[0].track, track).changed(recent=track.recent)
         if found.hypothesis is Hypothesis.NOISIER:
             return before.changed(window=risen(before.window, found.size))
         return self._disturbed(before, found) if found.hypothesis in _DISTURBANCES else before
