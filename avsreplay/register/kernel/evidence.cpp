@@ -127,7 +127,7 @@ Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const
         Match m = found[i];
         part.sum_d2 += m.d2;
         for (int a = 0; a < 3; ++a) part.sum[a] += m.p[a];
-        if (rule.noise > 0 && !matcher.is_of_face(m, feet[i], rule.noise)) continue;
+        if (!matcher.is_of_face(m, feet[i], rule.noise)) continue;
         onto_face(m), found[part.summed++] = m;
       }
     });
@@ -155,7 +155,7 @@ Evidence evidence(const Matcher& matcher, const Code& code, const View& v, const
     uint16_t off[CHUNK];
     const int n = matcher.inliers(k, found, off, rule.noise > 0 ? feet : nullptr);
     for (int i = 0; i < n; ++i) {
-      if (rule.noise > 0 && !matcher.is_of_face(found[i], feet[i], rule.noise)) continue;
+      if (!matcher.is_of_face(found[i], feet[i], rule.noise)) continue;
       onto_face(found[i]), code.add(found + i, &one, 1, out.patches.emplace_back());
     }
   }

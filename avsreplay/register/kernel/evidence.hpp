@@ -54,9 +54,9 @@ class Matcher {
 
   // Whether a point near an edge can be of the face with which it is matched: noise along the ray moves it off the face by no more
   // than its part along the normal. A face that the camera sees at a grazing angle takes points of its neighbours otherwise, which
-  // tell nothing of its place.
+  // tell nothing of its place. `at` is read with noise alone.
   bool is_of_face(const Match& m, const Footing& at, double noise) const {
-    if (!sided_ || is_clear(s_, at.lane, at.foot, CREDIBLE * noise)) return true;
+    if (noise <= 0 || !sided_ || is_clear(s_, at.lane, at.foot, CREDIBLE * noise)) return true;
     double range2 = 0, along = 0;
     for (int a = 0; a < 3; ++a) {
       const double ray = m.p[a] - look_.T[4 * a + 3];
