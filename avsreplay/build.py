@@ -21,7 +21,7 @@ from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan._cone import Body
 from avsreplay.plan.arm import with_arm
 from avsreplay.plan.guidance import Guidance
-from avsreplay.plan.limits import TargetGeometry, hull_vertices
+from avsreplay.plan.limits import TargetGeometry
 from avsreplay.plan.supervisor import Supervisor
 from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.region import Region
@@ -136,7 +136,7 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float]) -> Tar
     """
     return TargetGeometry(
         np.array(axis_c),
-        hull_vertices(surface.vertices),
+        surface.vertices,
         Body(
             np.ascontiguousarray(surface.vertices, float),
             np.ascontiguousarray(surface.faces, np.int32).reshape(-1, 3),

@@ -8,6 +8,8 @@ Parts are the sets of faces that are connected by edges of exactly two faces.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,11 +39,10 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
     """
-    corners = vertices[faces.reshape(-1, 3)]
+    faces = faces.reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
-    kept: Faces = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
+        wide = lengths(normals(vertices, faces)) > 0.0
+    kept: Faces = np.ascontiguousarray(faces if wide.all() else faces[wide], np.int32)
     return kept
 
 
@@ -56,13 +57,12 @@ def numbers_with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.i
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    longest2 = np.max(
-        [np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)],
-        axis=0,
-        initial=0.0,
-    )
-    area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    (ax, bx, cx), (ay, by, cy), (az, bz, cz) = _coordinates(vertices, faces)
+    ab2 = (bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2
+    bc2 = (cx - bx) ** 2 + (cy - by) ** 2 + (cz - bz) ** 2
+    ca2 = (ax - cx) ** 2 + (ay - cy) ** 2 + (az - cz) ** 2
+    longest2 = np.maximum(np.maximum(ab2, bc2), ca2)
+    area2 = lengths(normals(vertices, faces))
     return np.flatnonzero(area2 > 1e-12 * longest2).astype(np.int32)
 
 
@@ -96,8 +96,23 @@ def normals(vertices: Array, faces: Faces) -> Array:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a), dtype=np.float64)
+    (ax, bx, cx), (ay, by, cy), (az, bz, cz) = _coordinates(vertices, faces)
+    ux, uy, uz, wx, wy, wz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+    return np.stack([uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx], axis=1)
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the lengths (n,) of vectors (n, 3)."""
+    x, y, z = vectors.T
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
+
+
+def _coordinates(vertices: Array, faces: NDArray[Any]) -> list[list[Array]]:
+    """The x, y and z of the corners a, b and c of faces, (m,) each: numpy is several times as fast
+    on long rows.
+    """
+    corners = np.ascontiguousarray(faces.T)
+    return [[axis[k] for k in corners] for axis in np.ascontiguousarray(vertices.T)]
 
 
 def is_closed(vertices: Array, faces: Faces) -> bool:
@@ -129,8 +144,8 @@ def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     """
     if not len(faces):
         return faces, 0
-    first, number, turned = _distinct(_corners(vertices, faces))
-    reversed_, solid = _reversed(vertices, faces[first])
+    first, number, turned = _distinct(corners := _corners(vertices, faces))
+    reversed_, solid = _reversed(vertices, faces[first], corners[first])
     changed = reversed_[number] ^ (turned & solid[number])
     if not changed.any():
         return faces, 0
@@ -138,11 +153,13 @@ def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     return result, int(changed.sum())
 
 
-def _reversed(vertices: Array, faces: Faces) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _reversed(
+    vertices: Array, faces: Faces, corners: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which of distinct faces (m,) must be reversed, and which belong to a closed part with a
-    volume.
+    volume; ``corners``: as ``_corners`` gives them.
     """
-    parts = _parts(_edges(_corners(vertices, faces)))
+    parts = _parts(_edges(corners))
     wound = np.where(parts.reversed[:, None], faces[:, ::-1], faces)
     volume, area = _volumes(vertices, wound, parts.of)
     closed = parts.closed & (np.abs(volume) > LEAST_VOLUME_RATIO * area**1.5)
@@ -193,9 +210,7 @@ def open_parts(vertices: Array, faces: Faces) -> tuple[NDArray[np.int64], NDArra
         float(each[0]) for each in _volumes(vertices, faces, np.zeros(len(faces), np.int64))
     )
     flat = abs(volume) <= LEAST_VOLUME_RATIO * whole**1.5
-    first = distinct_rows(
-        np.column_stack([either, np.zeros_like(turned) if flat else turned]).astype(np.float64)
-    )[0]
+    first = _distinct_keys(either if flat else _keys(either, turned))[0]
     edges, few = _edges(corners[first]), faces[first]
     paired = edges.paired()
     if paired.all() and not flat:
@@ -222,14 +237,13 @@ def _openings(
     rim = np.flatnonzero(~paired)
     face, side = rim // 3, rim % 3
     start, end = corners[face, side], corners[face, (side + 1) % 3]
-    length = np.linalg.norm(
-        vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]], axis=1
-    )
+    length = lengths(vertices[faces[face, side]] - vertices[faces[face, (side + 1) % 3]])
     loop = components(int(corners.max()) + 1, start, end)[start]
-    key, number = np.unique(np.column_stack([of[face], loop]), axis=0, return_inverse=True)
-    around = np.bincount(number.ravel(), length, len(key))
+    first, number = _distinct_keys(_keys(of[face], loop))
+    around = np.bincount(number, length)
     return np.asarray(
-        np.bincount(key[:, 0], around**2 / (4.0 * np.pi), int(of.max()) + 1), dtype=np.float64
+        np.bincount(of[face][first], around**2 / (4.0 * np.pi), int(of.max()) + 1),
+        dtype=np.float64,
     )
 
 
@@ -268,9 +282,8 @@ def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
     A face with two equal corners is a part of its own.
     """
     step = MERGED_OF_EXTENT * float(np.ptp(vertices, axis=0).max())
-    corners = distinct_rows(
-        np.round((vertices - vertices.min(axis=0)) / max(step, np.finfo(float).tiny))
-    )[1][faces]
+    x, y, z = np.round((vertices - vertices.min(axis=0)) / max(step, np.finfo(float).tiny)).T
+    corners = _distinct_keys(_keys(_keys(x, y), z))[1][faces]
     flat = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
     corners[flat] = len(vertices) + np.arange(3 * np.count_nonzero(flat)).reshape(-1, 3)
     return corners
@@ -282,10 +295,33 @@ def _distinct(
     """Faces that differ: indices (k,), which of them (m,) each face equals, and whether its
     winding is the other.
     """
-    order = np.argsort(corners, axis=1, kind="stable")
-    even = (order[:, 1] - order[:, 0]) % 3 == 1
-    first, number = distinct_rows(np.take_along_axis(corners, order, axis=1).astype(np.float64))
+    a, b, c = corners.T
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    middle = a + b + c - low - high
+    even = ((a <= b) & (b <= c)) | ((b <= c) & (c < a)) | ((c < a) & (a <= b))
+    pair = _distinct_keys(_keys(low, middle))[1]
+    first, number = _distinct_keys(_keys(pair, high))
     return first, number, even != even[first[number]]
+
+
+def _keys(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
+    """One integer for each pair of integers of 0 and above: equal ones for equal pairs only, in
+    lexicographic order.
+    """
+    most = int(b.max(initial=0)) + 1
+    return np.asarray(a.astype(np.int64) * most + b.astype(np.int64))
+
+
+def _distinct_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """As ``distinct_rows``, of integers (n,) >= 0."""
+    order = np.argsort(keys, kind="stable")
+    begins = np.diff(keys[order], prepend=-1) != 0
+    place = np.empty(len(keys), dtype=np.int64)
+    first = order[begins]
+    place[np.sort(first)] = np.arange(len(first))
+    number = np.empty(len(keys), dtype=np.int64)
+    number[order] = place[first][np.cumsum(begins) - 1]
+    return np.sort(first), number
 
 
 def _edges(corners: NDArray[np.int64]) -> _Edges:
@@ -362,16 +398,13 @@ def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Arra
     """Six times the signed volume and the area of each part; tetrahedra from the centroid of
     its faces.
     """
-    corners = vertices[faces]
-    middles = corners.mean(axis=1)
-    centres = (
-        np.stack([np.bincount(of, middles[:, k]) for k in range(3)], axis=1)
-        / np.bincount(of)[:, None]
-    )
-    a, b, c = (corners[:, k] - centres[of] for k in range(3))
-    volumes = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    areas = np.bincount(of, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    return volumes.astype(np.float64), areas.astype(np.float64)
+    corners, doubled = _coordinates(vertices, faces), normals(vertices, faces)
+    count, heights = np.bincount(of), np.zeros(len(faces))
+    for (a, b, c), normal in zip(corners, doubled.T, strict=True):
+        centre = np.bincount(of, (a + b + c) / 3.0) / count
+        heights += (a - centre[of]) * normal
+    areas = np.bincount(of, 0.5 * lengths(doubled))
+    return np.bincount(of, heights), areas
 
 
 def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
@@ -385,11 +418,9 @@ def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
         return False
     points, corners = vertices[np.unique(part)], vertices[others]
     outermost = np.unique(np.argmax(points @ _CORNER_DIRECTIONS.T, axis=0))
-    a, b, c = (vertices[part[:, k]] for k in range(3))
-    largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable")[
-        : len(_CORNER_DIRECTIONS)
-    ]
-    tested = np.concatenate([((a + b + c) / 3.0)[largest], points[outermost]])
+    largest = np.argsort(-lengths(normals(vertices, part)), kind="stable")
+    middles = vertices[part[largest[: len(_CORNER_DIRECTIONS)]]].mean(axis=1)
+    tested = np.concatenate([middles, points[outermost]])
     return all(_solid_angle(corners - p) > 2.0 * np.pi for p in tested)
 
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from avsreplay import mesh
 from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.plan.limits import TargetGeometry
@@ -428,9 +429,8 @@ def patches(surface: Surface, closest: Closest) -> tuple[Patch, ...]:
 
 def _flat(surface: Surface) -> Iterator[tuple[Array, Array, float]]:
     """Grasp point, normal and area of parts of one plane, grown from the largest faces."""
-    corners = surface.vertices[surface.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(cross, axis=1)
+    corners, cross = surface.vertices[surface.faces], mesh.normals(surface.vertices, surface.faces)
+    doubled = mesh.lengths(cross)
     normals, areas = cross / np.maximum(doubled, 1e-300)[:, None], 0.5 * doubled
     middles, free = corners.mean(axis=1), areas > 0.0
     for seed in np.argsort(-areas, kind="stable")[:_SEED_FACES]:

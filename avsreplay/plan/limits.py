@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -143,21 +142,6 @@ class TargetGeometry:
     axis_c: Array
     hull_c: Array
     surface: _cone.Body | None = None
-
-
-def hull_vertices(vertices: Array) -> Array:
-    """Return the vertices (m, 3) of the convex hull of points, or the points if they are few or
-    have no hull.
-
-    Args:
-        vertices: (n, 3) points in any frame.
-    """
-    if len(vertices) > 100_000:  # the farthest of so many points is found in 3 ms
-        from scipy.spatial import ConvexHull, QhullError  # takes 0.2 s to import
-
-        with suppress(QhullError):
-            return np.asarray(vertices[np.sort(ConvexHull(vertices).vertices)])
-    return vertices
 
 
 @value_class

@@ -126,6 +126,7 @@ class Index:
         reach_m: float,
         threads: int = 1,
         portable: bool = False,
+        clearances: bool = True,
     ) -> None: ...
     @overload
     def __init__(

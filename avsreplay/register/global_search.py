@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
+from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
@@ -388,9 +388,7 @@ def principal_turns(surface: Surface) -> Array:
     """
     if len(surface.faces):
         corners = surface.vertices[surface.faces]
-        weight = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
+        weight = mesh.lengths(mesh.normals(surface.vertices, surface.faces))
         middle = corners.mean(axis=1)
         total = weight.sum()
         centre = weight @ middle / total

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
+from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
 from avsreplay.register.surface_index import kernel_module
@@ -80,16 +80,16 @@ def sample_faces(
         faces: (m, 3) vertex indices, m >= 1.
         count: number of points.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    twice_area = np.linalg.norm(cross, axis=1)
+    cross = mesh.normals(vertices, faces)
+    twice_area = mesh.lengths(cross)
     edges = np.cumsum(twice_area)
     face = np.searchsorted(edges, (np.arange(count) + 0.5) * (edges[-1] / count), side="right")
     face = np.minimum(face, len(edges) - 1)
     u, v = ((np.arange(1, count + 1)[:, None] * R2) % 1.0).T
     fold = u + v > 1.0
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
-    points = a[face] + u * (b - a)[face] + v * (c - a)[face]
+    a, b, c = (vertices[faces[face, k]] for k in range(3))
+    points = a + u * (b - a) + v * (c - a)
     return points, cross[face] / np.maximum(twice_area[face], np.finfo(float).tiny)[:, None], face
 
 

@@ -270,6 +270,7 @@ class SurfaceIndex:
         *,
         threads: int = 1,
         portable: bool = False,
+        clearances: bool = True,
         cache_dir: Path | None = None,
     ) -> SurfaceIndex:
         """Index ``surface`` for queries up to ``reach_m`` [m] from it.
@@ -280,8 +281,10 @@ class SurfaceIndex:
             threads: threads that build the index; the result does not depend on it.
             portable: use only the instructions that every processor of this kind has; the results
                 are identical.
-            cache_dir: folder in which the index is looked up and, where possible, saved under the
-                hash of the surface.
+            clearances: the index also knows how far the surface is flat, which ``grade`` and
+                ``evidence`` use; most of the time of building a large mesh.
+            cache_dir: folder in which the index with clearances is looked up and, where possible,
+                saved under the hash of the surface.
 
         Raises:
             UsageError: a surface with no primitive, too many or too large a surface, a coordinate
@@ -293,7 +296,7 @@ class SurfaceIndex:
         kernel = kernel_module()
         path = (
             None
-            if cache_dir is None
+            if cache_dir is None or not clearances
             else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
         )
         index = (
@@ -310,7 +313,9 @@ class SurfaceIndex:
                     where=surface.name,
                     hint="give a mesh with proper triangles",
                 )
-            index = kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
+            index = kernel.Index(
+                vertices, faces, kept, float(reach_m), threads, portable, clearances
+            )
             if path is not None:
                 index_cache.write(path, index.save(), kernel.checksum)
         size = int(index.primitives)

@@ -222,7 +222,7 @@ def _towards_cameras(surface: Surface) -> tuple[NDArray[np.int32], bool]:
     closed, opened = faces[part < 0], faces[part >= 0]
     sides = _sides(replace(surface, faces=faces), opened, part[part >= 0])
     wound = np.concatenate([closed, opened[sides != BACK], opened[sides != FRONT][:, ::-1]])
-    area = np.linalg.norm(mesh.normals(surface.vertices, faces), axis=1)
+    area = mesh.lengths(mesh.normals(surface.vertices, faces))
     both = area[part >= 0][sides == BOTH].sum()
     return np.ascontiguousarray(wound), bool(both <= (1.0 - LEAST_ONE_SIDED) * area.sum())
 
@@ -238,7 +238,7 @@ def _sides(
     v, extent = surface.vertices, surface.extent
     points, normals, of = sample_faces(v, faces, SIDE_POINTS)
     middle = 0.5 * (v.min(axis=0) + v.max(axis=0))
-    index = SurfaceIndex.build(surface, 0.05 * extent)
+    index = SurfaceIndex.build(surface, 0.05 * extent, clearances=False)
     front, back = np.zeros(len(points)), np.zeros(len(points))
     for direction in directions(VIEWS):
         rays = points - (eye := middle + VIEWED_FROM * extent * direction)
@@ -252,9 +252,7 @@ def _sides(
     axis = np.argmax(np.abs(normal), axis=1)
     towards = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0.0)
     cube = np.floor((corners.mean(axis=1) - middle) / (PATCH_OF_EXTENT * extent))
-    patch = np.unique(np.column_stack([part, towards, cube]), axis=0, return_inverse=True)[
-        1
-    ].ravel()
+    patch = mesh.distinct_rows(np.column_stack([part, towards, cube]))[1]
     of_part = np.unique(part, return_inverse=True)[1]
     seen = _counts(patch, of, front, back)
     seen = np.where(seen.sum(axis=0) > 0.0, seen, _counts(of_part, of, front, back))

@@ -20,6 +20,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import mesh
 from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
@@ -136,9 +137,8 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
     """
     count = len(surface.faces)
     zero = np.zeros(count)
-    corners = surface.vertices[surface.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = mesh.normals(surface.vertices, surface.faces)
+    normals /= np.maximum(mesh.lengths(normals), 1e-300)[:, None]
     optics = FaceOptics(
         np.full(count, DEFAULT_REFLECTANCE),
         zero.copy(),
@@ -148,10 +148,10 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
         normals,
     )
     groups = face_groups(surface) if any(material.group for material in materials) else []
-    centres = surface.vertices[surface.faces].mean(axis=1)
     for material in materials:
         inside = np.ones(count, dtype=bool)
         if material.box_m is not None:
+            centres = surface.vertices[surface.faces].mean(axis=1)
             inside = np.all(
                 (centres >= material.box_m[:3]) & (centres <= material.box_m[3:]), axis=1
             )

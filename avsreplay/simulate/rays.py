@@ -16,6 +16,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import mesh
 from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Surface
@@ -126,12 +127,11 @@ class RayCaster:
     """
 
     def __init__(self, surface: Surface, engine: Engine = Engine.AUTO) -> None:
-        corners = surface.vertices[surface.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        keep = np.linalg.norm(normals, axis=1) > 0.0  # no ray hits a triangle without area
-        self._index = np.flatnonzero(keep)
-        self._corners = np.ascontiguousarray(corners[keep])
-        self._normals = normals[keep] / np.linalg.norm(normals[keep], axis=1, keepdims=True)
+        normals = mesh.normals(surface.vertices, surface.faces)
+        length = mesh.lengths(normals)
+        self._index = np.flatnonzero(length > 0.0)  # no ray hits a triangle without area
+        self._corners = surface.vertices[surface.faces[self._index]]
+        self._normals = normals[self._index] / length[self._index, None]
         self.engine = _resolve(engine)
         build = _embree if self.engine is Engine.EMBREE else _exact
         self._search = build(self._corners)

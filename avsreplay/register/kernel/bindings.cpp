@@ -136,7 +136,7 @@ void check(const Doubles& vertices, const Ints& faces, const Ints& kept) {
 
 class Index {
  public:
-  Index(Doubles vertices, Ints faces, Ints kept, double reach, int threads, bool portable)
+  Index(Doubles vertices, Ints faces, Ints kept, double reach, int threads, bool portable, bool clearances)
       : portable_(portable) {
     require(vertices.ndim() == 2 && vertices.shape(1) == 3 && vertices.shape(0) > 0, "vertices must be (n, 3), n > 0");
     require(reach > 0 && reach < 1e12, "the reach must be positive and finite");
@@ -144,7 +144,7 @@ class Index {
     const Surface s{vertices.data(), (int64_t)vertices.shape(0), faces.data(), kept.data(), (int64_t)kept.shape(0)};
     nb::gil_scoped_release release;
     Team team(threads);
-    build(store_, s, reach, code(), team);
+    build(store_, s, reach, clearances, code(), team);
   }
 
   // From what `save` gave; the caller has checked that it is for this model and whole.
@@ -696,8 +696,9 @@ NB_MODULE(_kernel, m) {
       .def("refine", &refine, nb::arg("points"), nb::arg("T_ca"), nb::arg("passes"), nb::arg("gate_m"), nb::arg("fall"),
            nb::arg("floor_m"), nb::arg("beyond_m"), nb::arg("facing"), nb::arg("threads") = 1);
   nb::class_<Index>(m, "Index")
-      .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
-           nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
+      .def(nb::init<Doubles, Ints, Ints, double, int, bool, bool>(), nb::arg("vertices"), nb::arg("faces"),
+           nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false,
+           nb::arg("clearances") = true)
       .def(nb::init<Bytes, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("ids"),
            nb::arg("mesh"), nb::arg("portable") = false)
       .def("save", &Index::save)

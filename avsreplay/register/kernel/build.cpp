@@ -276,12 +276,12 @@ std::size_t Store::bytes() const {
          (top.size() + bricks.size() + lists.size()) * sizeof(uint32_t);
 }
 
-void build(Store& s, const Surface& surface, double reach, const Code& code, Team& team) {
+void build(Store& s, const Surface& surface, double reach, bool clearances, const Code& code, Team& team) {
   s.reach = reach;
   build_blocks(s, surface);
   if (!s.mesh) build_normals(s, code, team);
   build_cells(s, code, team);
-  if (s.mesh) build_clearances(s, code, team);
+  if (s.mesh && clearances) build_clearances(s, code, team);
 }
 
 }  // namespace avs

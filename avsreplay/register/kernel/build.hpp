@@ -14,8 +14,9 @@ struct Surface {
 };
 
 void build_cells(Store& store, const Code& code, Team& team);
-// Fills in how far the surface around each face is flat.
+// Fills in how far the surface around each face is flat, for `is_clear`.
 void build_clearances(Store& store, const Code& code, Team& team);
-void build(Store& store, const Surface& surface, double reach, const Code& code, Team& team);
+// Without `clearances` no point is known to be clear.
+void build(Store& store, const Surface& surface, double reach, bool clearances, const Code& code, Team& team);
 
 }  // namespace avs

@@ -89,7 +89,7 @@ double median(std::vector<double>& x) {
 }  // namespace
 
 bool is_clear(const Store& s, int32_t lane, const double* on, double distance) {
-  if (!s.mesh) return false;
+  if (s.clear.empty()) return false;
   const uint32_t levels = s.clear[(size_t)lane];
   const Triangle& t = s.triangles[(size_t)lane];
   const double d[3] = {on[0] - t.a.x, on[1] - t.a.y, on[2] - t.a.z};
