@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 
 namespace avs {
 namespace {
@@ -81,13 +80,12 @@ FaceTree::FaceTree(const double* vertices, size_t vertex_count, const int32_t* f
 
 void FaceTree::index() const {
   const size_t count = corners_.size();
-  std::vector<Vector3> middles(count);
-  for (size_t i = 0; i < count; ++i) middles[i] = (1.0 / 3.0) * (corners_[i][0] + corners_[i][1] + corners_[i][2]);
-  std::vector<uint32_t> order(count);
-  std::iota(order.begin(), order.end(), 0u);
-  if (count) build(0, static_cast<uint32_t>(count), order, middles);
+  std::vector<Middle> order(count);
+  for (size_t i = 0; i < count; ++i)
+    order[i] = {(1.0 / 3.0) * (corners_[i][0] + corners_[i][1] + corners_[i][2]), static_cast<uint32_t>(i)};
+  if (count) divide(0, static_cast<uint32_t>(count), order);
   std::vector<Face> sorted(count);
-  for (size_t i = 0; i < count; ++i) sorted[i] = corners_[order[i]];
+  for (size_t i = 0; i < count; ++i) sorted[i] = corners_[order[i].face];
   corners_ = std::move(sorted);
   for (const Face& face : corners_) {
     const Vector3 twice = cross(face[1] - face[0], face[2] - face[0]);
@@ -99,54 +97,80 @@ void FaceTree::index() const {
     }
     normals_.push_back(size > 2 * SLIVER * longest2 ? (1 / size) * twice : Vector3{});
   }
+  bound(order);
 }
 
-void FaceTree::build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order, const std::vector<Vector3>& middles) const {
+// Orders the middles of faces so that each node has those of its children one after the other.
+void FaceTree::divide(uint32_t begin, uint32_t end, std::vector<Middle>& order) const {
   const size_t at = nodes_.size();
   nodes_.emplace_back();
   dipoles_.emplace_back();
-  Node node;
-  Dipole dipole;
-  node.begin = begin;
-  node.end = end;
-  double whole = 0, radius = 0;
-  Vector3 low = middles[order[begin]], high = low, mean{};
-  node.low = node.high = corners_[order[begin]][0];
-  for (uint32_t i = begin; i < end; ++i) {
-    const Face& face = corners_[order[i]];
-    const Vector3 twice = cross(face[1] - face[0], face[2] - face[0]);
-    const double size = norm(twice) / 2;
-    whole += size;
-    for (size_t axis = 0; axis < 3; ++axis) {
-      const double middle = middles[order[i]][axis];
-      dipole.area[axis] += twice[axis] / 2;
-      dipole.centre[axis] += size * middle;
-      mean[axis] += middle / (end - begin);
-      low[axis] = std::min(low[axis], middle);
-      high[axis] = std::max(high[axis], middle);
-      for (const Vector3& corner : face) {
-        node.low[axis] = std::min(node.low[axis], corner[axis]);
-        node.high[axis] = std::max(node.high[axis], corner[axis]);
-      }
-    }
-  }
-  for (size_t axis = 0; axis < 3; ++axis) dipole.centre[axis] = whole > 0 ? dipole.centre[axis] / whole : mean[axis];
-  for (uint32_t i = begin; i < end; ++i)
-    for (const Vector3& corner : corners_[order[i]]) radius = std::max(radius, norm(corner - dipole.centre));
-  dipole.far2 = FAR_RADII * radius * FAR_RADII * radius;
-  dipoles_[at] = dipole;
   if (end - begin > LEAF) {
+    Vector3 low = order[begin].at, high = low;
+    for (uint32_t i = begin; i < end; ++i)
+      for (size_t axis = 0; axis < 3; ++axis) {
+        low[axis] = std::min(low[axis], order[i].at[axis]);
+        high[axis] = std::max(high[axis], order[i].at[axis]);
+      }
     const Vector3 size = high - low;
     const size_t axis = static_cast<size_t>(std::max_element(size.begin(), size.end()) - size.begin());
     const uint32_t middle = begin + (end - begin) / 2;
-    std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [&](uint32_t a, uint32_t b) {
-      return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
+    std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [axis](const Middle& a, const Middle& b) {
+      return a.at[axis] != b.at[axis] ? a.at[axis] < b.at[axis] : a.face < b.face;
     });
-    build(begin, middle, order, middles);
-    build(middle, end, order, middles);
+    divide(begin, middle, order);
+    divide(middle, end, order);
   }
-  node.next = static_cast<uint32_t>(nodes_.size());
-  nodes_[at] = node;
+  nodes_[at].begin = begin;
+  nodes_[at].end = end;
+  nodes_[at].next = static_cast<uint32_t>(nodes_.size());
+}
+
+// Boxes and dipoles of the nodes, from the leaves up.
+void FaceTree::bound(const std::vector<Middle>& order) const {
+  struct Sum {
+    double area = 0;
+    Vector3 weighted{}, plain{};  // sums of the middles, weighted by the areas and not
+  };
+  std::vector<Sum> sums(nodes_.size());
+  for (size_t at = nodes_.size(); at-- > 0;) {
+    Node& node = nodes_[at];
+    Dipole& dipole = dipoles_[at];
+    Sum& sum = sums[at];
+    if (node.next == at + 1) {
+      node.low = node.high = corners_[node.begin][0];
+      for (uint32_t i = node.begin; i < node.end; ++i) {
+        const Face& face = corners_[i];
+        const Vector3 normal = 0.5 * cross(face[1] - face[0], face[2] - face[0]);
+        const double size = norm(normal);
+        sum.area += size;
+        sum.weighted = sum.weighted + size * order[i].at;
+        sum.plain = sum.plain + order[i].at;
+        dipole.area = dipole.area + normal;
+        for (const Vector3& corner : face)
+          for (size_t axis = 0; axis < 3; ++axis) {
+            node.low[axis] = std::min(node.low[axis], corner[axis]);
+            node.high[axis] = std::max(node.high[axis], corner[axis]);
+          }
+      }
+    } else {
+      const size_t left = at + 1, right = nodes_[left].next;
+      sum = {sums[left].area + sums[right].area, sums[left].weighted + sums[right].weighted, sums[left].plain + sums[right].plain};
+      dipole.area = dipoles_[left].area + dipoles_[right].area;
+      for (size_t axis = 0; axis < 3; ++axis) {
+        node.low[axis] = std::min(nodes_[left].low[axis], nodes_[right].low[axis]);
+        node.high[axis] = std::max(nodes_[left].high[axis], nodes_[right].high[axis]);
+      }
+    }
+    dipole.centre = sum.area > 0 ? (1 / sum.area) * sum.weighted : (1.0 / (node.end - node.begin)) * sum.plain;
+    double radius2 = 0;
+    for (uint32_t i = node.begin; i < node.end; ++i)
+      for (const Vector3& corner : corners_[i]) {
+        const Vector3 away = corner - dipole.centre;
+        radius2 = std::max(radius2, dot(away, away));
+      }
+    dipole.far2 = FAR_RADII * FAR_RADII * radius2;
+  }
 }
 
 double FaceTree::winding(const Vector3& q) const {

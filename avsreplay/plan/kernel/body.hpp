@@ -48,8 +48,13 @@ class FaceTree {
     Vector3 centre{}, area{};  // area: sum of the normals of the faces, each as long as its area
     double far2 = 0;           // squared distance from which on it replaces them
   };
+  struct Middle {  // of a face
+    Vector3 at{};
+    uint32_t face = 0;
+  };
   void index() const;
-  void build(uint32_t begin, uint32_t end, std::vector<uint32_t>& order, const std::vector<Vector3>& middles) const;
+  void divide(uint32_t begin, uint32_t end, std::vector<Middle>& order) const;
+  void bound(const std::vector<Middle>& order) const;
   double winding(const Vector3& q) const;
   double distance(const Vector3& q, double most, double rounding, Vector3& foot, uint32_t& face) const;
 
