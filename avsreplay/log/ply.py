@@ -198,7 +198,11 @@ class _Text:
         """Return the first list of each line; lists of equal length, the common case, are
         converted at once.
         """
-        rows = [line.split() for line in self._take(element)]
+        lines = self._take(element)
+        before = next((i for i, p in enumerate(element.properties) if p.count is not None), None)
+        if before is None:
+            return []
+        rows = [line.split()[before:] for line in lines]
         if not all(
             words and words[0].isdigit() and len(words) > int(words[0][:9]) for words in rows
         ):
