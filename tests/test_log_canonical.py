@@ -196,11 +196,14 @@ def test_the_field_with_information_is_used() -> None:
     assert any("'time' is not used" in each.evidence for each in meaning.inferences)
 
 
-def test_unix_seconds_in_float32_are_refused_by_name() -> None:
-    meaning = meaning_of(log(Sensor(), "timestamp", "s", "f4", "clock"), 0.1)
+@pytest.mark.parametrize(("unit", "step"), [("s", "128 s"), ("ms", "131 s")])
+def test_a_unix_time_in_float32_is_refused_by_name(unit: str, step: str) -> None:
+    """What it resolves is stated: 2^7 s, or 2^17 ms."""
+    meaning = meaning_of(log(Sensor(), "timestamp", unit, "f4", "clock"), 0.1)
     assert meaning.refused is not None
     assert "'timestamp'" in meaning.refused.finding
     assert "--point-time" in meaning.refused.option
+    assert f"which resolves {step}" in meaning.refused.finding
 
 
 def test_the_offset_of_another_clock_is_found_and_said() -> None:
