@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from avsreplay.cli.main import SUMMARIES, group
 from avsreplay.cli.run import job_of, run_command
-from avsreplay.config import load_config
+from avsreplay.config import PAPER, load_config
 from avsreplay.errors import AvsError
 
 LINES = 62
@@ -73,6 +73,16 @@ def test_the_time_and_the_mode_of_the_start_are_two_options():
     assert job.options.start_s == 2.0
     assert load_config(None, {}, job.assignments).estimator.start.value == "near"
     assert invoked("run", "log", "--start", "near").exit_code == 2
+
+
+@pytest.mark.parametrize("given", [(), ("--paper",), ("--paper", "--set", "faults.sigmas=4")])
+def test_the_method_of_the_paper_is_used_where_it_is_asked_for_and_settings_precede_it(given):
+    with run_command.make_context("run", ["log", *given]) as context:
+        flags = dict(context.params)
+        job = job_of(Path(flags.pop("log")), flags)
+    found, paper = (load_config(None, {}, each) for each in (job.assignments, PAPER))
+    assert (found.estimator == paper.estimator) is ("--paper" in given)
+    assert (found.faults == paper.faults) is (given == ("--paper",))
 
 
 def test_a_log_in_place_of_a_command_suggests_the_command(fixtures_folder, tmp_path):
