@@ -4,15 +4,18 @@ content.
 
 from __future__ import annotations
 
+import math
 import struct
 from contextlib import suppress
+from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
+import pytest
 
 from avsreplay.log.ply import read_ply
-from avsreplay.log.scan_files import read_pcd
+from avsreplay.log.scan_files import read_pcd, read_points
 from avsreplay.read_budget import BadFile
 
 CODES = {
@@ -109,6 +112,26 @@ def test_a_ply_file_gives_what_was_written() -> None:
         with suppress(BadFile):  # cut anywhere
             part = read_ply(whole[: len(whole) - 1 - rng.randrange(len(body))])
             assert list(part.vertex) == list(found.vertex)
+
+
+@pytest.mark.parametrize("sizes", [(3, 3), (3, 4)])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e30])
+def test_a_corner_that_is_no_number_is_read_without_a_warning(
+    sizes: tuple[int, int], value: float
+) -> None:
+    """Lists of one length are read by other instructions than lists of several."""
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\n"
+    head += "element face 2\nproperty list uchar float vertex_indices\nend_header\n"
+    body = struct.pack("<f", 0.0)
+    body += b"".join(struct.pack(f"<B{n}f", n, *[value] * n) for n in sizes)
+    found = read_ply(head.encode() + body).faces
+    assert len(found) == sum(n - 2 for n in sizes)
+    assert not (found == 0).any()
+
+
+def test_a_cloud_of_no_bytes_has_no_points(tmp_path: Path) -> None:
+    (tmp_path / "0.bin").write_bytes(b"")
+    assert len(read_points(tmp_path / "0.bin", 1 << 20)) == 0
 
 
 def lzf(data: bytes) -> bytes:
