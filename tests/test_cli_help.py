@@ -4,6 +4,7 @@ messages that name the next step.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -11,9 +12,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from avsreplay.cli.main import SUMMARIES, group
+from avsreplay.cli.plan import CHANGES
 from avsreplay.cli.run import job_of, run_command
-from avsreplay.config import PAPER, load_config
+from avsreplay.config import PAPER, RunConfig, load_config
 from avsreplay.errors import AvsError
+from avsreplay.settings import entries
 
 LINES = 62
 FIRST = b'{"seq": 0}\n'
@@ -43,6 +46,26 @@ def test_the_help_of_a_command_fits_a_screen_and_refers_to_all_options(name):
     whole = invoked(name, "--help-all").stdout if "--help-all" in short else short
     for option in options_of(name):
         assert option in whole
+
+
+@pytest.mark.parametrize("name", SUMMARIES)
+def test_the_help_states_every_default_that_is_a_number_or_a_path(name):
+    command = group.get_command(click.Context(group), name)
+    assert command is not None
+    for param in command.params:
+        if isinstance(param, click.Option) and not param.is_flag:
+            has_default = isinstance(param.default, (int, float, str, Path)) and param.default != ""
+            assert param.show_default or not has_default, param.opts
+
+
+def test_the_changes_that_are_tried_are_settings_and_become_larger():
+    """With the first factor with which a plan is found, the change that is named is the least."""
+    known = {entry.key for entry in entries(RunConfig)}
+    for key, factors in CHANGES:
+        assert key in known
+        assert 1.0 not in factors
+        sizes = [abs(math.log(max(factor, 1e-9))) for factor in factors]
+        assert sizes == sorted(set(sizes)), key
 
 
 def test_a_command_without_a_model_has_no_option_for_one():
