@@ -206,6 +206,21 @@ def test_a_unix_time_in_float32_is_refused_by_name(unit: str, step: str) -> None
     assert f"which resolves {step}" in meaning.refused.finding
 
 
+@pytest.mark.parametrize(("unit", "step"), [("s", "0.0156 s"), ("ms", "0.016 s")])
+def test_a_clock_that_resolves_too_little_is_refused_with_what_it_resolves(
+    unit: str, step: str
+) -> None:
+    """Two days in float32: 2^-6 s, or 2^4 ms."""
+    sample = []
+    for stamp, points, after in Sensor().clouds():
+        days = written(after, stamp, "clock") - EPOCH + 200_000 * 10**9
+        raw = of_points(points.astype(np.float32), stamp, "lidar", t=field(days, unit, "f4"))
+        sample.append(TimedCloud(raw, stamp))
+    meaning = meaning_of(sample, 0.1)
+    assert meaning.refused is not None
+    assert f"'t': it resolves {step}, too little" in meaning.refused.finding
+
+
 def test_the_offset_of_another_clock_is_found_and_said() -> None:
     sensor = Sensor()
     meaning = meaning_of(log(sensor, "timestamp", "s", "f8", "boot"), 0.1)
