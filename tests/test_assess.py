@@ -229,6 +229,25 @@ def setup_of():
     )
 
 
+@pytest.mark.parametrize(("opening_m", "position_m"), [(0.0, 0.01), (0.2, 0.01), (0.1, 0.03)])
+def test_the_gripper_encloses_half_its_opening_and_the_error_of_its_position(opening_m, position_m):
+    """A path along the face of a cube: no contact as far as the gripper reaches beside the grasp
+    point, contact beyond.
+    """
+    made = setup_of()
+    grip = replace(
+        made.task,
+        opening_m=opening_m,
+        tolerance=replace(made.task.tolerance, position_m=position_m),
+    )
+    made, reach = replace(made, task=grip), 0.5 * opening_m + position_m
+    assert made.task.radius_m == 0.0
+    for side, touched in ((0.99 * reach, False), (1.01 * reach, True)):
+        depth = np.linspace(0.9 * reach, -0.9 * reach, 50)
+        path = np.column_stack([depth, 0.0 * depth + side, 0.0 * depth])
+        assert made.touched(path) is touched
+
+
 def test_simulated_flights_keep_what_is_known_of_a_body_whose_principal_axes_are_not():
     """As a cube that turns about one axis: the pose is known, inertia and mass centre are not."""
     x = State(

@@ -4,6 +4,7 @@ messages that name the next step.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -11,9 +12,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from avsreplay.cli.main import SUMMARIES, group
+from avsreplay.cli.plan import CHANGES
 from avsreplay.cli.run import job_of, run_command
-from avsreplay.config import load_config
+from avsreplay.config import PAPER, RunConfig, load_config
 from avsreplay.errors import AvsError
+from avsreplay.settings import entries
 
 LINES = 62
 FIRST = b'{"seq": 0}\n'
@@ -45,6 +48,26 @@ def test_the_help_of_a_command_fits_a_screen_and_refers_to_all_options(name):
         assert option in whole
 
 
+@pytest.mark.parametrize("name", SUMMARIES)
+def test_the_help_states_every_default_that_is_a_number_or_a_path(name):
+    command = group.get_command(click.Context(group), name)
+    assert command is not None
+    for param in command.params:
+        if isinstance(param, click.Option) and not param.is_flag:
+            has_default = isinstance(param.default, (int, float, str, Path)) and param.default != ""
+            assert param.show_default or not has_default, param.opts
+
+
+def test_the_changes_that_are_tried_are_settings_and_become_larger():
+    """With the first factor with which a plan is found, the change that is named is the least."""
+    known = {entry.key for entry in entries(RunConfig)}
+    for key, factors in CHANGES:
+        assert key in known
+        assert 1.0 not in factors
+        sizes = [abs(math.log(max(factor, 1e-9))) for factor in factors]
+        assert sizes == sorted(set(sizes)), key
+
+
 def test_a_command_without_a_model_has_no_option_for_one():
     for name in ("odometry", "model"):
         assert "--topic" in options_of(name)
@@ -73,6 +96,16 @@ def test_the_time_and_the_mode_of_the_start_are_two_options():
     assert job.options.start_s == 2.0
     assert load_config(None, {}, job.assignments).estimator.start.value == "near"
     assert invoked("run", "log", "--start", "near").exit_code == 2
+
+
+@pytest.mark.parametrize("given", [(), ("--paper",), ("--paper", "--set", "faults.sigmas=4")])
+def test_the_method_of_the_paper_is_used_where_it_is_asked_for_and_settings_precede_it(given):
+    with run_command.make_context("run", ["log", *given]) as context:
+        flags = dict(context.params)
+        job = job_of(Path(flags.pop("log")), flags)
+    found, paper = (load_config(None, {}, each) for each in (job.assignments, PAPER))
+    assert (found.estimator == paper.estimator) is ("--paper" in given)
+    assert (found.faults == paper.faults) is (given == ("--paper",))
 
 
 def test_a_log_in_place_of_a_command_suggests_the_command(fixtures_folder, tmp_path):

@@ -802,6 +802,34 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(
             assert not disturbed.size[3 - kind : 6 - kind].any()
 
 
+def still_epochs(count: int, rng: np.random.Generator) -> list[Epoch]:
+    """Scans of a free body at 2 Hz, with white noise of 1 mm and 1 mrad."""
+    start = Belief(0, tumbling.draw(2, seconds=7.0).states[0], np.eye(20) * 1e-10)
+    R, x, epochs = np.eye(6) * 1e-6, start.x, []
+    for k in range(count):
+        x = propagate_state(x, 0.5)[0]
+        later = Belief(round((k + 1) * 5e8), x, start.P)
+        prior = Prediction(later, np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
+        seen = Innovation(1e-3 * rng.normal(size=6), R, R, 1.0, 0.0, 0.0, 0.0)
+        epochs.append(Epoch(Track(start, "filter"), prior, seen, False))
+    return epochs
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_a_change_of_no_size_has_its_prior_odds(count: int) -> None:
+    """It is free motion, whenever it begins and whatever it acts on. Of a manoeuvre those that take
+    longer than an instant are left out, because nothing changed.
+    """
+    epochs = still_epochs(count, np.random.Generator(np.random.PCG64(3)))
+    priors = scan_window.ChangePriors(1e-8, 1e-8, 1e-8, 1e-8)
+    _, ranked = hypotheses.explain(epochs, 1, priors, 0.0, 0.0)
+    value = {each.hypothesis: each.log_evidence for each in ranked}
+    free, least = value[scan_window.Hypothesis.FREE_MOTION], math.log(1e-3)
+    for kind in (scan_window.Hypothesis.ACCELERATED, scan_window.Hypothesis.SENSOR_BIAS):
+        assert value[kind] - free == pytest.approx(least, abs=1e-6)
+    assert least - 0.5 < value[scan_window.Hypothesis.MANOEUVRE] - free < least
+
+
 @pytest.mark.parametrize("cancels", [False, True])
 def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
     """Half a second at 0.3 m/s: a step of the pose by 15 cm if the target stops again, an

@@ -292,6 +292,17 @@ def test_the_joint_fit_reaches_the_minimum_of_the_true_motion_from_a_sphere(seed
     assert is_bounded(found, widths)
 
 
+@pytest.mark.parametrize("widths", [np.eye(6)[1] * 1e-3, np.eye(6)[5] * 1e-2])
+def test_an_acceleration_along_one_axis_is_determined_by_a_few_poses(widths: np.ndarray) -> None:
+    case = surprises.Case("c", seconds=4.0)
+    poses, truth = poses_of(fixes_of(case, 2)), to_chart(surprises.world_of(case, 2)[1][0])
+    fitted = fit_jointly(
+        poses, truth, weak_prior(poses, PARAMS), np.ones(2), 0.0, np.zeros(6), widths
+    )
+    assert np.flatnonzero(fitted.u).tolist() == np.flatnonzero(widths).tolist()
+    assert is_bounded(fitted, widths)
+
+
 def test_the_derivatives_along_the_motion_are_those_of_differences() -> None:
     """Residuals with a torque and a force since an instant within the poses, by chart steps,
     acceleration and onset.

@@ -196,11 +196,29 @@ def test_the_field_with_information_is_used() -> None:
     assert any("'time' is not used" in each.evidence for each in meaning.inferences)
 
 
-def test_unix_seconds_in_float32_are_refused_by_name() -> None:
-    meaning = meaning_of(log(Sensor(), "timestamp", "s", "f4", "clock"), 0.1)
+@pytest.mark.parametrize(("unit", "step"), [("s", "128 s"), ("ms", "131 s")])
+def test_a_unix_time_in_float32_is_refused_by_name(unit: str, step: str) -> None:
+    """What it resolves is stated: 2^7 s, or 2^17 ms."""
+    meaning = meaning_of(log(Sensor(), "timestamp", unit, "f4", "clock"), 0.1)
     assert meaning.refused is not None
     assert "'timestamp'" in meaning.refused.finding
     assert "--point-time" in meaning.refused.option
+    assert f"which resolves {step}" in meaning.refused.finding
+
+
+@pytest.mark.parametrize(("unit", "step"), [("s", "0.0156 s"), ("ms", "0.016 s")])
+def test_a_clock_that_resolves_too_little_is_refused_with_what_it_resolves(
+    unit: str, step: str
+) -> None:
+    """Two days in float32: 2^-6 s, or 2^4 ms."""
+    sample = []
+    for stamp, points, after in Sensor().clouds():
+        days = written(after, stamp, "clock") - EPOCH + 200_000 * 10**9
+        raw = of_points(points.astype(np.float32), stamp, "lidar", t=field(days, unit, "f4"))
+        sample.append(TimedCloud(raw, stamp))
+    meaning = meaning_of(sample, 0.1)
+    assert meaning.refused is not None
+    assert f"'t': it resolves {step}, too little" in meaning.refused.finding
 
 
 def test_the_offset_of_another_clock_is_found_and_said() -> None:

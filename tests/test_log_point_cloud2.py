@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import product
 
 import numpy as np
 import pytest
@@ -102,6 +103,27 @@ def test_every_layout_gives_the_original_points(data: st.DataObject) -> None:
     assert cloud.stamp_ns == 12_000_000_345
     assert cloud.frame == "lidär"
     np.testing.assert_array_equal(np.asarray(cloud.points, dtype=np.float64), want.reshape(-1, 3))
+
+
+@pytest.mark.parametrize("kinds", list(product(("f4", "f8"), repeat=3)))
+@pytest.mark.parametrize("order", ["xyz", "zyx", "xzy"])
+def test_adjacent_coordinates_of_any_kinds_give_the_original_points(
+    kinds: tuple[str, str, str], order: str
+) -> None:
+    """Also where the distance of two coordinates in memory is the size of another one."""
+    fields, at = [], 0
+    for name in order:
+        fields.append((name, at, kinds["xyz".index(name)]))
+        at += int(fields[-1][2][1])
+    want = np.random.Generator(np.random.PCG64(3)).normal(size=(5, 3))
+    table = np.empty(5, {k: [f[i] for f in fields] for i, k in enumerate(("names", "offsets"))} | {
+        "formats": [f"<{kind}" for _, _, kind in fields]
+    })  # fmt: skip
+    for axis, kind, column in zip("xyz", kinds, want.T, strict=True):
+        column[:] = column.astype(kind)
+        table[axis] = column
+    found = decode_cloud(message(fields, table.tobytes(), 5, 1, at, 5 * at))
+    np.testing.assert_array_equal(np.asarray(found.points, dtype=np.float64), want)
 
 
 def test_the_common_layout_is_a_view_and_not_a_copy() -> None:

@@ -17,6 +17,7 @@ from avsreplay.outcome import PlanStatus
 from avsreplay.plan._cone import Body
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.constrained import constrained, linearised_s, with_safety
+from avsreplay.plan.convexification import Case, warm_reference
 from avsreplay.plan.limits import SampledScene, Scene, margin
 from avsreplay.plan.path import StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
@@ -280,6 +281,33 @@ def test_a_warm_start_gives_the_same_plan():
     later = constrained(scene.after(2.0), r, v, PARAMS, limits, warm=(path, 2.0))
     assert later.t_go_s + 2.0 == pytest.approx(plan.t_go_s, abs=0.1)
     assert later.violation_m == 0.0
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.7])
+@pytest.mark.parametrize("since_s", [0.0, 3.0])
+def test_the_rest_of_a_path_ends_at_the_target_when_the_path_does(latency_s, since_s):
+    """A robot on its path has its path for a reference. Beside it, and with another target, the
+    reference begins at the robot and ends at the grasp point.
+    """
+    scene, params = body(), replace(PARAMS, latency_s=latency_s)
+    path = path_of(rendezvous(scene.goal, ORIGIN, ORIGIN, params), ORIGIN, ORIGIN)
+    left_s, r, v = path.t_go_s - since_s, *(x[0] for x in path.at(np.array([since_s])))
+    shift, off = np.array([0.02, -0.05, 0.03]), np.array([0.3, 0.2, -0.1])
+    moved = Scene(lambda t: (scene.goal(t)[0] + shift, scene.goal(t)[1])).after(since_s)
+    limits = Limits(nodes=30)
+    for target, begin in ((scene.after(since_s), r), (moved, r + off)):
+        sampled = SampledScene(target, params.horizon_s, params.grid_s, params.horizon_s)
+        found = warm_reference(Case(sampled, limits, params, begin, v, 0.01), path, since_s)
+        s = found.t * np.arange(1, 61) / 60.0
+        assert found.t == pytest.approx(left_s - latency_s, rel=1e-12)
+        assert found.r[-1] == pytest.approx(target.goal(np.array([left_s]))[0][0], abs=1e-6)
+        along = path.at(since_s + latency_s + s)[0]
+        shifts = found.r - along  # from the robot's to the grasp point's
+        if latency_s == 0.0 and begin is r:
+            assert np.abs(shifts).max() < 1e-6
+        if begin is not r:
+            first = begin + latency_s * v - path.at(np.array([since_s + latency_s]))[0][0]
+            assert shifts[0] == pytest.approx(first, abs=1e-3)
 
 
 def _ball():

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+import runpy
 import sys
 import tempfile
 import tracemalloc
@@ -273,6 +274,16 @@ def test_a_run_is_written_in_the_memory_of_some_of_its_rows(tmp_path, make_rows,
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 2.0 * peaks[0] + 100_000
+
+
+@pytest.mark.parametrize(
+    ("words", "name"), [((), "columns.md"), (["--schema"], "rows.schema.json")]
+)
+def test_the_module_prints_the_page_of_the_columns_and_the_schema(words, name, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["export", *words])
+    monkeypatch.delitem(sys.modules, "avsreplay.report.export")
+    runpy.run_module("avsreplay.report.export", run_name="__main__")
+    assert capsys.readouterr().out == (ROOT / "docs" / name).read_text(encoding="utf-8")
 
 
 def test_the_column_list_of_the_docs_is_current():

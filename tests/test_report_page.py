@@ -20,7 +20,7 @@ from avsreplay.cli.record import report_command
 from avsreplay.errors import AvsError, UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
-from avsreplay.report.charts import charts, derived, embed, most_telling, spans
+from avsreplay.report.charts import PLACE_STYLES, charts, derived, embed, most_telling, spans
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import Flight, build_flight_page, build_page, render
 from avsreplay.report.result import load_result
@@ -284,6 +284,21 @@ def test_60000_scans_make_a_page_below_10_mb_that_says_what_it_shows(make_rows):
     assert len(page) < 10e6
     assert re.search(r"The charts show \d+ of 60000 scans", page)
     assert "60000 scans" in page.split("<main>")[0] or "of 60000 scans used" in page
+
+
+def test_no_two_known_kinds_look_the_same(make_rows):
+    """A reason, an injected fault and an action differ in colour or in pattern."""
+    columns = {"flagged": "reason", "injected": "fault", "action": "action"}
+    styles = [
+        (span["colour"], span["pattern"])
+        for lane, words in PLACE_STYLES.items()
+        for word in words
+        for span in spans(make_rows(1, gamma=0, **{columns[lane]: word}))
+        if (span["lane"], span["word"]) == (lane, word)
+    ]
+    assert len(styles) == sum(map(len, PLACE_STYLES.values()))
+    assert len(set(styles)) == len(styles)
+    assert {k for style in styles for k in style} <= set(range(6))
 
 
 def test_values_are_in_millimetres_where_the_tables_say_so(make_rows):

@@ -428,6 +428,24 @@ def test_a_manoeuvre_is_the_cause_of_the_scans_that_were_rejected_before_it_was_
     }
 
 
+@pytest.mark.parametrize("kind", ["manoeuvres", "reinitialised"])
+@pytest.mark.parametrize("at", [1, 2, 20])
+def test_what_was_found_at_a_scan_is_no_cause_of_a_later_one(make_rows, kind, at):
+    """Whether the scan before was used or not: it is the cause of the first used scan since."""
+    clean = {"gamma": 1, "reason": "ok", "fault": None, "nis": 6.0, "converged": True, kind: 0}
+    rows = [dataclasses.replace(r, **clean) for r in make_rows(n=30)]
+    rows = [dataclasses.replace(r, **({kind: 1} if r.seq >= at else {})) for r in rows]
+    for place in range(max(at - 1, 1), at + 4):
+        for skipped in {at, place} - {place}, set():
+            changed = {k: {"gamma": 0, "reason": "doubtful"} for k in skipped if k < place}
+            changed[place] = {"nis": 60.0}
+            found = [dataclasses.replace(r, **changed.get(r.seq, {})) for r in rows]
+            (cause,) = {m.cause for m in worst_moments(found) if m.row == place}
+            named = cause.startswith(("manoeuvre", "the estimate was reinitialised"))
+            first_used = min(k for k in range(at, 30) if k not in changed or k == place)
+            assert named is (place == first_used)
+
+
 def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
     """Some scans of the fault were flagged, so that it counts as detected, but others moved the
     estimate.

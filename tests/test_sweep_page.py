@@ -138,6 +138,7 @@ def test_faults_are_grouped_by_kind_with_false_alarms_first(summary):
         lost=1,
         peak_flagged=Peak(0.0123, 0.004),
         peak_used=Peak(1.25, 178.6),
+        peak_after=Peak(0.0003, 0.057),
     )
     clutter = FaultKind(False, (0.5,), (2.0,), 4, rate(0, 4), 1, rate(0, 1))
     none = FaultKind(False, (), (), 200, rate(1, 200))
@@ -153,7 +154,8 @@ def test_faults_are_grouped_by_kind_with_false_alarms_first(summary):
     ]
     assert found[0][2:] == ["", "0.5%", *[""] * 7]
     assert found[2][2:] == ["0.5, 2 s", "0.0%", "0/1", "", "", "0", "", "", ""]
-    assert found[4][2:] == ["2 s", "75.0%", "2/2", "1, 1.5", "", "1", "12, 0.004", "1250, 179", ""]
+    peaks = ["12, 0.004", "1250, 179", "0.3, 0.057"]
+    assert found[4][2:] == ["2 s", "75.0%", "2/2", "1, 1.5", "", "1", *peaks]
 
 
 def test_without_faults_there_is_no_table_of_them(summary):

@@ -198,7 +198,11 @@ class _Text:
         """Return the first list of each line; lists of equal length, the common case, are
         converted at once.
         """
-        rows = [line.split() for line in self._take(element)]
+        lines = self._take(element)
+        before = next((i for i, p in enumerate(element.properties) if p.count is not None), None)
+        if before is None:
+            return []
+        rows = [line.split()[before:] for line in lines]
         if not all(
             words and words[0].isdigit() and len(words) > int(words[0][:9]) for words in rows
         ):
@@ -260,7 +264,7 @@ class _Binary:
                     if count < 0:
                         raise BadFile(f"a list of {count} in '{element.name}'")
                 values = self._read(np.dtype(self._order + p.kind), count, element.name)
-                found = values.astype(np.int64) if p.count is not None and found is None else found
+                found = _whole(values) if p.count is not None and found is None else found
             out.append(np.zeros(0, np.int64) if found is None else found)
         return out
 
@@ -280,9 +284,13 @@ class _Binary:
         if not np.all(table["n"] == count):
             return None
         self._at += size
-        with np.errstate(all="ignore"):
-            values: NDArray[np.int64] = table["v"].astype(np.int64)
-        return values
+        return _whole(table["v"])
+
+
+def _whole(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Whole numbers of values of any type; what none is has no meaning, and is no corner."""
+    with np.errstate(all="ignore"):
+        return np.asarray(values.astype(np.int64))
 
 
 def _triangles(lists: _Lists) -> NDArray[np.int64]:

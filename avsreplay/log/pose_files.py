@@ -278,23 +278,33 @@ class _Columns:
 
 
 def _columns(names: list[str], where: str) -> _Columns:
-    """The columns that a header line names.
+    """The columns that a header line names; of several times the first.
 
-    Raises UnreadableInput if one of the eight is missing or named twice.
+    Raises UnreadableInput if one of the eight is missing, if one of the pose is named twice, or if
+    the coordinates differ in their unit.
     """
     found: dict[str, tuple[int, str]] = {}  # place and unit of each
+    problem = ""
     for place, name in enumerate(_NOT_A_NAME.sub("_", n.lower()).strip("_") for n in names):
         if time := _TIME_HEADING.match(name):
             found.setdefault("t", (place, time[1] or "s"))
-        elif position := _POSITION.match(name):
-            found.setdefault(f"p{position[1]}", (place, position[2] or "m"))
+            continue
+        if position := _POSITION.match(name):
+            key, unit = f"p{position[1]}", position[2] or "m"
         elif turn := _QUATERNION_HEADING.match(name):
-            found.setdefault(f"q{turn[1]}", (place, ""))
+            key, unit = f"q{turn[1]}", ""
+        else:
+            continue
+        if key in found:
+            problem = f"two columns for {key}"
+        found[key] = place, unit
     missing = [key for key in ("t", *_POSE_NAMES) if key not in found]
     if missing:
-        raise UnreadableInput(
-            f"no column for {', '.join(missing)}", where=where, hint=_FORMATS_HELP
-        )
+        problem = f"no column for {', '.join(missing)}"
+    elif len({found[key][1] for key in _POSE_NAMES[:3]}) > 1:
+        problem = "coordinates in different units"
+    if problem:
+        raise UnreadableInput(problem, where=where, hint=_FORMATS_HELP)
     place, unit = found["t"]
     pose = tuple(found[key][0] for key in _POSE_NAMES)
     return _Columns(place, _EXPONENTS.get(unit[0], ""), pose, _METRES[found["px"][1]])

@@ -74,13 +74,15 @@ def bin_columns(data: bytes) -> int:
     Raises:
         BadFile: no number of values divides it.
     """
+    if not data:
+        return _BIN_COLUMNS[0]
     fitting = [n for n in _BIN_COLUMNS if len(data) % (4 * n) == 0]
     if not fitting:
         raise BadFile(f"{len(data)} bytes are not whole KITTI points of 16, or others up to 32")
     values = np.nan_to_num(np.frombuffer(data, "<f4").astype(np.float64), posinf=0.0, neginf=0.0)
     values = np.clip(values, -1e6, 1e6)
     within = {n: float(values.reshape(-1, n).var(axis=0).mean()) for n in fitting}
-    least = _FAR_BETTER * min(within.values(), default=0.0)
+    least = _FAR_BETTER * min(within.values())
     return next(n for n in fitting if within[n] <= least or n == fitting[-1])
 
 

@@ -82,7 +82,7 @@ PLACE_STYLES = {  # colour and pattern of each place
 FIRST = ("position", "nis", "capture")  # charts that stand beside the states; others are folded
 # largest difference of two lines, over the range of the first, that are drawn as one
 SAME_LINE_DIFFERENCE = 1e-3
-_FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
+_FIRST_PATTERN = {"flagged": 0, "injected": 2, "action": 4}  # two patterns for each lane
 
 
 def derived(rows: Sequence[Row]) -> Columns:

@@ -6,7 +6,7 @@ assessed from what is known then; after that the flight goes on against the true
 of the thrust and blackouts. Finished flights are appended to a file and not flown again.
 
 python tests/benchmarks/capture_calibration.py FILE.jsonl [--first SEED] [--count N] [--seconds S]
-    [--flights N]
+    [--flights N] [--corridor] [--thrust FACTOR]
 python tests/benchmarks/capture_calibration.py FILE.jsonl --figure docs/images/calibration.svg
 """
 
@@ -57,12 +57,20 @@ KICKS = (1e-5, 1e-4)  # root density of the angular acceleration with disturbanc
 AXIS = (1.0, 0.0, 0.0)
 
 
-def flown(seed: int, flights: int) -> dict[str, object]:
-    """One flight: what was predicted at t_1 and at its end, and what happened."""
+def flown(seed: int, flights: int, corridor: bool, thrust_errors: float) -> dict[str, object]:
+    """One flight: what was predicted at t_1 and at its end, and what happened.
+
+    Args:
+        seed: of the body, the motion and all noise.
+        flights: simulated flights of the prediction.
+        corridor: whether the robot approaches through the corridor along the axis, as by default.
+        thrust_errors: factor of the errors of the thrust.
+    """
     rng = np.random.default_rng([seed, 77])
     J = np.array(MOMENTS[seed % 10])
     disturbed, robot_at = bool(seed // 10 % 2), seed // 20 % 2
     a_max, delay_s, thrust = ROBOTS[robot_at]
+    thrust *= thrust_errors
     # Larger ones turn the target by more than the tolerance within the planned time: no t_1.
     kick = np.exp(np.random.default_rng([seed, 78]).uniform(*np.log(KICKS))) if disturbed else 0.0
     cube = builtin_surface(Shape.CUBE)
@@ -95,6 +103,7 @@ def flown(seed: int, flights: int) -> dict[str, object]:
     supervisor, robot = SupervisorParams(), RobotParams(thrust_noise=thrust)
     given = TaskParams(**sizes, angle_deg=2.0 * share)
     task = task_of(given, supervisor, robot, AXIS, surface, geometry_c.surface, limits)
+    limits = task.corridor(limits) if corridor else limits
     plan = PlanParams(a_max_mps2=a_max, latency_s=delay_s)
     supervision = given.with_tolerance(supervisor).resolved(extent)
     guidance = Guidance(plan, Supervisor(supervision), limits, extent)
@@ -185,6 +194,8 @@ def flown(seed: int, flights: int) -> dict[str, object]:
         "body": seed % 10,
         "disturbed": disturbed,
         "robot": robot_at,
+        "corridor": corridor,
+        "thrust": thrust_errors,
         "t1_s": known_s,
         "predicted": None if predicted is None else predicted.probability,
         "contact": None if predicted is None else predicted.contact,
@@ -192,6 +203,7 @@ def flown(seed: int, flights: int) -> dict[str, object]:
         "captured": captured,
         "touched": touched,
         "action": state.decision.action.value,
+        "rule": state.decision.rule,
     }
 
 
@@ -283,10 +295,12 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--flights", type=int, default=12)
+    parser.add_argument("--corridor", action="store_true", help="approach along the axis")
+    parser.add_argument("--thrust", type=float, default=1.0, help="factor of the errors of thrust")
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     seeds = [] if given.figure else in_turn(given.first, given.count)
-    fly = lambda seed: [flown(seed, given.flights)]  # noqa: E731
+    fly = lambda seed: [flown(seed, given.flights, given.corridor, given.thrust)]  # noqa: E731
     rows = continued(given.file, seeds, itemgetter("seed"), fly, given.seconds)
     report(rows)
     if given.figure:
