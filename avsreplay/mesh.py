@@ -89,7 +89,7 @@ def distinct_rows(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.sort(first), number
 
 
-def normals(vertices: Array, faces: Faces) -> Array:
+def normals(vertices: Array, faces: NDArray[Any]) -> Array:
     """Return the normals (m, 3) of faces by the right-hand rule, as long as twice their area [m^2].
 
     Args:
@@ -403,8 +403,8 @@ def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Arra
     for (a, b, c), normal in zip(corners, doubled.T, strict=True):
         centre = np.bincount(of, (a + b + c) / 3.0) / count
         heights += (a - centre[of]) * normal
-    areas = np.bincount(of, 0.5 * lengths(doubled))
-    return np.bincount(of, heights), areas
+    volumes, areas = (np.bincount(of, each) for each in (heights, 0.5 * lengths(doubled)))
+    return volumes.astype(np.float64), areas.astype(np.float64)
 
 
 def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:

@@ -281,8 +281,8 @@ class SurfaceIndex:
             threads: threads that build the index; the result does not depend on it.
             portable: use only the instructions that every processor of this kind has; the results
                 are identical.
-            clearances: the index also knows how far the surface is flat, which ``grade`` and
-                ``evidence`` use; most of the time of building a large mesh.
+            clearances: the index also stores how far the surface is flat, which ``grade`` and
+                ``evidence`` use; this takes most of the time of building for a large mesh.
             cache_dir: folder in which the index with clearances is looked up and, where possible,
                 saved under the hash of the surface.
 
