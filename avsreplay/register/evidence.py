@@ -412,10 +412,6 @@ class EvidenceModel:
         D = np.ascontiguousarray(G @ T_ca.R.T)
         ranges, cosine, normal = self._cast(T_ca.t, D)
         hit = np.isfinite(ranges)
-        angle, nearest = (each[:, 0] for each in seen.tree.query(np.ascontiguousarray(G), 1))
-        empty = angle > HOLE * seen.pitch
-        missing = hit & empty & (cosine > EXPECTED_COSINE)
-        places = T_ca.t + D[missing] * ranges[missing, None]
         I = np.arange(len(G)).reshape(shape)
         pairs = np.concatenate(
             [
@@ -428,8 +424,15 @@ class EvidenceModel:
                 )
             ]
         )
-        L = self._extent
         a, b = pairs[hit[pairs[:, 0]]].T
+        asked = hit.copy()  # the nearest return of other directions is not needed
+        asked[b] = True
+        angle, nearest = np.full(len(G), np.inf), np.zeros(len(G), dtype=np.intp)
+        angle[asked], nearest[asked] = (each[:, 0] for each in seen.tree.query(G[asked], 1))
+        empty = angle > HOLE * seen.pitch
+        missing = hit & empty & (cosine > EXPECTED_COSINE)
+        places = T_ca.t + D[missing] * ranges[missing, None]
+        L = self._extent
         # An edge: no face of the model is near the plane of the face at a, also of a steep one.
         on_plane = _to_plane(normal[a], D[a], ranges[a], D[b])
         behind = ranges[b] < np.maximum(on_plane, ranges[a]) + 0.05 * L
