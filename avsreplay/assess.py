@@ -37,8 +37,8 @@ from avsreplay.estimate.chart import (
     to_state,
 )
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import Adaptation, NoiseSource
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
 from avsreplay.outcome import CaptureError, Plan, PlanStatus

@@ -35,7 +35,7 @@ from avsreplay.binary_files import parse_npy, read_limited, read_members
 from avsreplay.errors import UnreadableInput
 from avsreplay.read_budget import BadFile, ReadBudget
 
-CHECKPOINT_VERSION = 2  # of the format of the document; a file of another version is not read
+CHECKPOINT_VERSION = 3  # of the format of the document; a file of another version is not read
 
 _PACKAGE = __name__.partition(".")[0]
 _HINT = "start the run anew with --overwrite"

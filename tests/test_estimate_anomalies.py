@@ -25,6 +25,7 @@ from avsreplay.estimate import (
     hypotheses,
     noise,
     pose_differences,
+    pose_noise,
     scan_window,
 )
 from avsreplay.estimate.dynamics import after_change, grasp_forecast, propagate, propagate_state
@@ -114,8 +115,9 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     )
     S, alpha, one_sigma = H @ P @ H.swapaxes(1, 2) + R, 3.0 * rng.normal(size=(2, 6)), (0.2, 0.3)
     share, none, y = 0.2, np.zeros(12), alpha.reshape(-1)
-    used = [_motion.used(Phi[k], P[k], H[k], alpha[k], S[k], R[k], (1.0, 1.0)) for k in range(2)]
-    ratio, moments = _motion.change(np.array(used), one_sigma, [0.3, 0.1, 0.03, 0.01], 1.0, share)
+    used = [_motion.used(Phi[k], P[k], H[k], alpha[k], S[k], R[k], R[k]) for k in range(2)]
+    sizes = [0.3, 0.1, 0.03, 0.01]
+    ratio, moments = _motion.change(np.array(used), one_sigma, sizes, 1.0, share, 1e3)
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
     ratios, weighted = [], []
     for first, part, kind, size in itertools.product(
@@ -158,11 +160,15 @@ def test_the_moments_of_a_possible_change_are_no_less_than_zero() -> None:
             info = 10.0 ** rng.uniform(0.0, 7.0, size=6)
             alpha = rng.normal(size=6) / np.sqrt(info)
             gain = 300.0 * np.outer(by, towards) + 0.1 * rng.normal(size=(6, 20))
-            parts = Phi, H, alpha, np.diag(info), gain
+            parts = Phi, H, alpha, np.diag(np.sqrt(info)), gain
             used.append(np.concatenate([each.ravel() for each in parts]))
-        _, moments = _motion.change(np.array(used), (0.05, 0.02), [1.0, 0.1], 1.0, 0.0)
+        _, moments = _motion.change(np.array(used), (0.05, 0.02), [1.0, 0.1], 1.0, 0.0, np.inf)
         eigenvalues = np.linalg.eigvalsh(moments)
         assert eigenvalues[0] >= -1e-12 * eigenvalues[-1]
+        # updates that let a change grow without bound say nothing about it
+        ratio, none = _motion.change(np.array(used), (0.05, 0.02), [1.0, 0.1], 1.0, 0.0, 1e-6)
+        assert ratio == 0.0
+        assert not none.any()
 
 
 def test_nothing_is_found_on_a_clean_log() -> None:
@@ -598,10 +604,10 @@ def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
     indefinite = factor @ factor.T - 1e-10 * np.eye(12)
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.cholesky(indefinite)
-    root = noise.cholesky_root(indefinite)
+    root = pose_noise.cholesky_root(indefinite)
     assert np.abs(root @ root.T - indefinite).max() < 1e-8 * np.trace(indefinite)
     definite = indefinite + np.eye(12)
-    np.testing.assert_array_equal(noise.cholesky_root(definite), np.linalg.cholesky(definite))
+    np.testing.assert_array_equal(pose_noise.cholesky_root(definite), np.linalg.cholesky(definite))
 
 
 @pytest.mark.parametrize(

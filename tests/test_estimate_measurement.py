@@ -31,7 +31,6 @@ from avsreplay.estimate.measurement import (
     chart_update,
     gain,
     in_fixture,
-    inflated,
     innovation_of,
     innovation_vector,
     joseph,
@@ -42,6 +41,7 @@ from avsreplay.estimate.measurement import (
     residual,
     step_of_sets,
 )
+from avsreplay.estimate.pose_noise import scaled_R
 from avsreplay.geometry import Pose
 from avsreplay.monitor.gramian import gramian, measure, observe, weakest
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, State
@@ -219,7 +219,7 @@ def aimed(
     H, S, alpha = measurement_jacobian(x), np.eye(6), np.eye(6)[0]
     H[0] = rng.normal(size=20)
     H[0] *= size / max(1e-300, np.abs(P @ H[0])[[0, 1, 2, 6, 7, 8, 14, 15, 16, 17, 18, 19]].max())
-    wide = inflated(R, colour)
+    wide = scaled_R(R, np.sqrt(colour))
     K = gain(P, H, S + (wide - R))
     want, P_want = retract(x, joseph(P, H, K, wide), K @ alpha)
     got = chart_update(Belief(0, x, P), H, Innovation(alpha, S, R, 0.0, 0.0, 0.0, 0.0), colour)
@@ -380,10 +380,13 @@ def test_the_innovation_and_its_covariances_are_those_of_general_linear_algebra(
             np.trace(B @ B) + np.trace(B) ** 2, rel=1e-6
         )
         squares, known = _motion.block_squares(R, e, part)
-        for k, block in enumerate((slice(0, 3), slice(3, 6))):
-            info = np.linalg.inv(R[block, block])
-            assert squares[k] == pytest.approx(float(e[block] @ info @ e[block]), rel=1e-6)
-            assert known[k] == pytest.approx(float(np.trace(info @ part[block, block])), rel=1e-6)
+        away = np.hstack([np.eye(3), -R[:3, 3:] @ np.linalg.inv(R[3:, 3:])])  # given the attitude
+        for k, block in enumerate((away, np.eye(6)[3:])):
+            info = np.linalg.inv(block @ R @ block.T)
+            left = block @ e
+            assert squares[k] == pytest.approx(float(left @ info @ left), rel=1e-6)
+            C = block @ part @ block.T
+            assert known[k] == pytest.approx(float(np.trace(info @ C)), rel=1e-6)
         values, axes = np.linalg.eigh(R)
         assert _motion.definite(R)
         assert not _motion.definite(R - 1.001 * values[0] * np.outer(axes[:, 0], axes[:, 0]))

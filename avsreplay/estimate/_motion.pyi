@@ -21,7 +21,7 @@ def correct(
     alpha: Array,
     S: Array,
     R: Array,
-    colour: tuple[float, float],
+    noise: Array,
 ) -> tuple[Array, Array]: ...
 def innovation(P: Array, H: Array, alpha: Array, R: Array) -> tuple[Array, bool, float]: ...
 def pose_jacobian(x: Array) -> Array: ...
@@ -39,7 +39,7 @@ def used(
     alpha: Array,
     S: Array,
     R: Array,
-    colour: tuple[float, float],
+    noise: Array,
 ) -> Array: ...
 def change(
     scans: Array,
@@ -47,6 +47,7 @@ def change(
     sizes: list[float],
     scale: float,
     share: float,
+    most: float,
 ) -> tuple[float, Array]: ...
 def forecast(
     x: Array,
@@ -99,7 +100,7 @@ def without_drift(
 def corrected_poses(
     x: Array, attitude: Array, centre: Array, error: Array, moved: Array
 ) -> tuple[Array, Array]: ...
-def roots(C: Array) -> tuple[Array, Array]: ...
+def roots(C: Array) -> Array: ...
 def above(P: Array, least: float) -> bool: ...
 def impulses(
     q: Array,
@@ -163,7 +164,7 @@ class Weighed:
     ) -> None: ...
 
 class Poses:
-    def __init__(self, times: Array, q: Array, t: Array, root: Array, info: Array) -> None: ...
+    def __init__(self, times: Array, q: Array, t: Array, shift: Array, root: Array) -> None: ...
 
 class Problem:
     def __init__(self, poses: Poses, mean: Array, prior_info: Array) -> None: ...

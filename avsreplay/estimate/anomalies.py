@@ -33,10 +33,11 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
 )
 from avsreplay.estimate.mixture import moments
-from avsreplay.estimate.noise import cholesky_root, lasting, risen
+from avsreplay.estimate.noise import lasting, risen
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.pose_differences import MOST_DISTURBED, disturbance_levels
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.scan_points import latest
 from avsreplay.estimate.scan_window import (
     EXPLAINED,

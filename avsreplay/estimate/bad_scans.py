@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from avsreplay.estimate import _motion
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.scan_window import (
     OFFSETS,
     PRIOR_ODDS,

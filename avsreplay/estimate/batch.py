@@ -84,8 +84,10 @@ class Poses:
         within: squared whitened differences of poses from their normal points, of attitude and
             position, and their degrees of freedom; None where there are none.
         arc: the orbit from the epoch on; None for free motion.
+        shift: (n, 6) added to d, None for 0: the mean of the poses that a normal point stands for
+            lies at -shift from it. Along directions that they do not determine this may be too far
+            for a linear covariance.
         root: (n, 6, 6) lower triangular with root C root' = 1.
-        info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
     """
 
     times_s: Array
@@ -96,13 +98,11 @@ class Poses:
     shares: Array | None = None
     within: tuple[tuple[float, float], float] | None = None
     arc: OrbitArc | None = None
+    shift: Array | None = None
     root: Array = field(init=False)
-    info: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        root, info = _motion.roots(self.C)
-        object.__setattr__(self, "root", root)
-        object.__setattr__(self, "info", info)
+        object.__setattr__(self, "root", _motion.roots(self.C))
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -110,7 +110,22 @@ class Poses:
     @property
     def core(self) -> _motion.Poses:
         """The poses, as the extension takes them."""
-        return _motion.Poses(times=self.times_s, q=self.q, t=self.t, root=self.root, info=self.info)
+        return _motion.Poses(
+            times=self.times_s,
+            q=self.q,
+            t=self.t,
+            shift=self.shifts,
+            root=self.root,
+        )
+
+    def whitened(self, d: Array, factors: Array) -> Array:
+        """(n, 6) residuals d of unit variance, with noise factors (2,) of attitude and position."""
+        return np.asarray((self.root @ d[:, :, None])[:, :, 0] / np.repeat(factors, 3))
+
+    @property
+    def shifts(self) -> Array:
+        """(n, 6) ``shift``, zeros where there is none."""
+        return np.zeros((len(self), 6)) if self.shift is None else self.shift
 
     def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
         """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where
@@ -131,6 +146,7 @@ class Poses:
             self.C[which],
             shares=shares,
             arc=self.arc,
+            shift=None if self.shift is None else self.shift[which],
         )
 
     def moved(self, q: Array, t: Array) -> Poses:
@@ -149,6 +165,7 @@ class Poses:
             self.t[-count:],
             self.C[-count:],
             arc=arc,
+            shift=None if self.shift is None else self.shift[-count:],
         )
 
 
@@ -398,20 +415,13 @@ def _noise_of(problem: Problem, every: Poses) -> tuple[Array, Array]:
     """Noise factors (2,) and inflation (2,), of attitude and position, from the residuals of all
     poses.
 
-    The squared factor is the mean of d' C^-1 d plus J P J', the part that the fit absorbed; the
+    The squared factor is the mean of the squares of root d, plus those of root J P^1/2, the part
+    that the fit absorbed; the
     inflation is 1 + 2 sum of the residuals' autocorrelations.
     """
-    d = every.residuals(problem)
-    white = (every.root @ (d / np.repeat(problem.factors, 3))[:, :, None])[:, :, 0]
+    white = every.whitened(every.residuals(problem), problem.factors)
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
-    sizes = np.einsum(
-        "n,nbi,nbij,nbj->b",
-        weights,
-        d.reshape(-1, 2, 3),
-        every.info,
-        d.reshape(-1, 2, 3),
-        optimize=False,
-    )
+    sizes = (weights[:, None] * white**2).reshape(-1, 2, 3).sum(axis=(0, 2)) * problem.factors**2
     factors = np.sqrt(
         (sizes + problem.core.absorbed(problem.covariance)) / (3.0 * float(weights.sum()))
     )

@@ -32,13 +32,13 @@ from avsreplay.estimate.driven import drift_equivalents
 from avsreplay.estimate.dynamics import MOST_RAD, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, REACHED, ROUNDING, definite
 from avsreplay.estimate.mixture import Component, volumes
-from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.noise_levels import (
     POSE_BLOCKS,
     NoiseLevels,
     mean_share,
     pose_error_covariance,
 )
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.geometry import Array
 

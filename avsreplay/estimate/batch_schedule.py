@@ -42,6 +42,7 @@ from avsreplay.estimate.mixture import carried, contradicted, moments, not_worse
 from avsreplay.estimate.noise import NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.pose_noise import scaled
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array
@@ -115,13 +116,11 @@ class BatchSchedule:
             last.factors * np.sqrt(last.inflation),
             self.noise_levels(track),
         )
-        root = _motion.roots(fix.C[None])[0][0]
+        root = _motion.roots(fix.C[None])[0]
         mixture = carried(
             last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit
         )
-        C = fix.C * np.outer(
-            np.repeat(factors, 3), np.repeat(factors, 3)
-        )  # components may lie further apart
+        C = scaled(fix.C, factors)  # components may lie further apart
         mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
         belief, t_ns = moments(mixture), prediction.belief.t_ns
         belief = belief if belief.t_ns == t_ns else self.propagated(track, belief, t_ns)[0]
@@ -407,8 +406,7 @@ def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]
         fix: the last of its poses.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
     """
-    scale = np.repeat(result.factors * np.sqrt(result.inflation), 3)
-    C = fix.C * np.outer(scale, scale)
+    C = scaled(fix.C, result.factors * np.sqrt(result.inflation))
     mixture = not_worse(result.components, fix.t_ns, fix.T_ac, C, fix.weight, noise, fix.orbit)
     if mixture is result.components:
         return result

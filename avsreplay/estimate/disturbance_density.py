@@ -23,7 +23,7 @@ import numpy as np
 
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.geometry import Array
 
 # root densities of a disturbance that are compared with none; over a log of 100 s the least changes

@@ -34,10 +34,11 @@ from avsreplay.estimate.measurement import (
     innovation_vector,
     measurement_jacobian,
 )
-from avsreplay.estimate.noise import NO_INFLATION, cholesky_root
+from avsreplay.estimate.noise import NO_INFLATION
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.normal_points import PositionRows, position_rows
 from avsreplay.estimate.params import Adaptation
+from avsreplay.estimate.pose_noise import cholesky_root, scaled
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array
 from avsreplay.records import UNLIKELY, Drift
@@ -294,8 +295,8 @@ def no_worse_than_pose(belief: DrivenBelief, fix: PoseFix, factors: Array) -> Dr
 
     ``factors`` (2,) are on the standard deviations of attitude and position.
     """
-    x, scale, H = belief.x, np.repeat(factors, 3), measurement_jacobian(belief.x)
-    root = cholesky_root(in_camera(fix.C * np.outer(scale, scale), fix.T_ac.q, x.q_bc))
+    x, H = belief.x, measurement_jacobian(belief.x)
+    root = cholesky_root(in_camera(scaled(fix.C, factors), fix.T_ac.q, x.q_bc))
     whiten = np.linalg.inv(root)
     values, axes = np.linalg.eigh(whiten @ H @ belief.P @ H.T @ whiten.T)
     if values[-1] <= 1.0 or fix.lag_ns:

@@ -33,10 +33,11 @@ from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, RHO, VEL, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
-from avsreplay.estimate.noise import BOUND, cholesky_root
+from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_NORMAL_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import PositionRows, gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
@@ -63,6 +64,7 @@ class PoseFix:
         count: number of poses that it stands for.
         orbit: the relative orbit that the target is on; None for free motion.
         weight: Cauchy weight of the pose in the update.
+        shift: (6,) as in ``batch.Poses``, of one that stands for several; None for 0.
     """
 
     t_ns: int
@@ -73,6 +75,7 @@ class PoseFix:
     count: int = 1
     orbit: RelativeOrbit | None = None
     weight: float = 1.0
+    shift: Array | None = None
 
     @property
     def scan_ns(self) -> int:
@@ -158,6 +161,7 @@ def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
     """The fixes as input of the fit, times from the epoch, by default the first pose."""
     t0 = fixes[0].t_ns if epoch_ns is None else epoch_ns
     counts, orbit = [f.count for f in fixes], fixes[0].orbit
+    joined_ones = any(f.shift is not None for f in fixes)
     return Poses(
         np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
         np.array([f.T_ac.q for f in fixes]),
@@ -166,6 +170,9 @@ def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
         np.array(counts) if max(counts) > 1 else None,
         shares=np.array([f.correlated_share for f in fixes]),
         arc=None if orbit is None else orbit.at(t0),
+        shift=np.array([np.zeros(6) if f.shift is None else f.shift for f in fixes])
+        if joined_ones
+        else None,
     )
 
 
@@ -187,14 +194,24 @@ def joined(fixes: tuple[PoseFix, ...], reference: Chart, factors: Array) -> tupl
     shares = np.zeros(len(points)) if points.shares is None else points.shares
     counts = np.ones(len(points)) if points.counts is None else points.counts
     return tuple(
-        PoseFix(fixes[0].t_ns + round(t * 1e9), Pose(q, p), C, 0, share, int(count), fixes[0].orbit)
-        for t, q, p, C, share, count in zip(
+        PoseFix(
+            fixes[0].t_ns + round(t * 1e9),
+            Pose(q, p),
+            C,
+            0,
+            share,
+            int(count),
+            fixes[0].orbit,
+            shift=shift,
+        )
+        for t, q, p, C, share, count, shift in zip(
             points.times_s.tolist(),
             points.q,
             points.t,
             points.C,
             shares.tolist(),
             counts,
+            points.shifts,
             strict=True,
         )
     )

@@ -34,6 +34,7 @@ from avsreplay.estimate.error_state import (
     hamilton,
     rotation,
 )
+from avsreplay.estimate.pose_noise import scaled_R
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import BLOCKS, UNLIKELY, Alignment, Belief, Innovation, State
 
@@ -261,9 +262,11 @@ def constrained_update(
 ) -> tuple[Belief, int]:
     """Posterior of a healthy epoch (gamma 1) by the paper's gain, and how many sigma bounds acted.
 
-    ``inflation`` (2,) of attitude and position is that of ``inflated``.
+    ``inflation`` (2,) of attitude and position multiplies the variances of R: correlated errors
+    carry less information than white ones. S of the innovation itself is not inflated, because a
+    single scan has the noise R.
     """
-    R = inflated(innovation.R, inflation / innovation.weight)
+    R = scaled_R(innovation.R, np.sqrt(inflation / innovation.weight))
     K = gain(prior.P, H, innovation.S + (R - innovation.R))
     betas, hits = sigma_bounds(prior.x.sigma, K[SIGMA] @ innovation.alpha, margin)
     if hits:
@@ -296,13 +299,13 @@ def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Arr
     Gain, Joseph's form and the displacement of mean and P by the chart's Jacobians are one call of
     the extension.
     """
-    x, factors = prior.x, inflation / innovation.weight
-    alpha, S, R = innovation.alpha, innovation.S, innovation.R
-    mean, P = _motion.correct(x.flat, prior.P, H, alpha, S, R, factors.tolist())
+    x, alpha, S, R = prior.x, innovation.alpha, innovation.S, innovation.R
+    noise = scaled_R(R, np.sqrt(inflation / innovation.weight))
+    mean, P = _motion.correct(x.flat, prior.P, H, alpha, S, R, noise)
     then = Belief(prior.t_ns, State.of(mean), P)
     if not isinstance(prior, DrivenBelief):
         return then
-    return corrected(prior, then, H, S + inflated(R, factors) - R, alpha)
+    return corrected(prior, then, H, S + noise - R, alpha)
 
 
 def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:
@@ -311,16 +314,6 @@ def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:
     L.flat[::21] += 1.0
     out: Array = L @ P @ L.T + K @ R @ K.T
     return out
-
-
-def inflated(R: Array, inflation: Array) -> Array:
-    """R times ``inflation`` (2,), of attitude and position: correlated errors carry less
-    information than white ones.
-
-    S of the innovation itself is not inflated: a single scan has the noise R.
-    """
-    c = np.sqrt(np.repeat(inflation[::-1], 3))
-    return np.asarray(R * np.outer(c, c))
 
 
 _MOTION = 12

@@ -26,7 +26,8 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import MOST_RAD, forecast_of, torque_density, translation
 from avsreplay.estimate.error_state import DIM, definite, rotation
-from avsreplay.estimate.noise import BOUND, NO_INFLATION, cholesky_root
+from avsreplay.estimate.noise import BOUND, NO_INFLATION
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
@@ -226,7 +227,7 @@ def not_worse(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         orbit: the relative orbit that the target is on; None for free motion.
     """
-    whiten = _motion.roots(C[None])[0][0]
+    whiten = _motion.roots(C[None])[0]
     if components[0].t_ns != t_ns:
         components = without_pose(components, t_ns, pose, noise, orbit)
     values, axes = _excess(components, whiten)

@@ -26,12 +26,14 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.common_errors import systematic_share
 from avsreplay.estimate.measurement import registration_noise, residual
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
+from avsreplay.estimate.pose_noise import scaled_R
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Alignment, Belief, Innovation, State
 
 BOUND = 52.4  # 99.99 % point of chi-square with 20 degrees of freedom, for a state
 NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
+_BLOCKS = [3, 0]  # attitude and position of factors (6,) on R
 # standard deviation of an attitude direction that a degenerate view does not determine
 _FREE_RAD = 1.0
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
@@ -92,10 +94,13 @@ class NoiseRise:
     factor: Array
     calm: float = 0.0
 
-    @property
-    def squared(self) -> Array:
-        """(6, 6) factors on the covariance of a pose."""
-        return self.factor[:, None] * self.factor
+    def on(self, R: Array) -> Array:
+        """R (6, 6) with this rise."""
+        return scaled_R(R, self.factor[_BLOCKS])
+
+    def off(self, R: Array) -> Array:
+        """R (6, 6) without this rise."""
+        return scaled_R(R, 1.0 / self.factor[_BLOCKS])
 
 
 NO_RISE = NoiseRise(_ONES)
@@ -159,7 +164,7 @@ def lasting(window: NoiseWindow, seen: Innovation) -> NoiseWindow:
     rise = window.rise
     if rise is NO_RISE:
         return window
-    usual = seen.S - seen.R + seen.R / rise.squared
+    usual = seen.S - seen.R + rise.off(seen.R)
     chi2 = [float(seen.alpha @ np.linalg.solve(C, seen.alpha)) for C in (seen.S, usual)]
     logs = np.linalg.slogdet(np.stack([seen.S, usual]))[1]
     calm = max(0.0, rise.calm + 0.5 * float(chi2[0] - chi2[1] + logs[0] - logs[1]))
@@ -203,9 +208,9 @@ def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
     ``base`` (6, 6).
     """
     attitude, position = factors.tolist()
-    s, level = factors[::-1].repeat(3), (position**2, attitude**2)
+    level = position**2, attitude**2
     epoch = NoiseEpoch(
-        base * np.outer(s, s), np.zeros((6, 6)), (3.0 * level[0], 3.0 * level[1]), (3.0, 3.0), 1.0
+        scaled_R(base, factors), np.zeros((6, 6)), (3.0 * level[0], 3.0 * level[1]), (3.0, 3.0), 1.0
     )
     return _summed((epoch,) * length, length, level)
 
@@ -253,33 +258,6 @@ def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
     return out
 
 
-def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a covariance that rounding may have made indefinite, or of several
-    of one size.
-
-    Args:
-        C: (..., n, n) covariance.
-
-    Returns:
-        (..., n, n) factor of C; if one is indefinite, of each plus the smallest multiple of the
-        identity, relative to its mean variance, that suffices for all.
-
-    Raises:
-        ValueError: no multiple suffices, as with a matrix that is not finite.
-    """
-    try:
-        return np.asarray(np.linalg.cholesky(C))
-    except np.linalg.LinAlgError:
-        n = C.shape[-1]
-    more = np.trace(C, axis1=-2, axis2=-1)[..., None, None] / n * np.eye(n)
-    for k in range(-13, 1):
-        try:
-            return np.asarray(np.linalg.cholesky(C + 10.0**k * more))
-        except np.linalg.LinAlgError:
-            continue
-    raise ValueError("the covariance of the window is not finite")
-
-
 class Noise:
     """R (6, 6) [m, half-angle] of a measured pose.
 
@@ -296,17 +274,17 @@ class Noise:
 
     def of(self, alignment: Alignment, x: State, window: NoiseWindow) -> Array:
         """The base R with the rise and the adaptation of the window, and with the floor applied."""
-        R = self._base(alignment, x) * window.rise.squared
+        R = window.rise.on(self._base(alignment, x))
         if self.params.adapt is Adaptation.MATRIX:
             R = matrix_noise(window, self._R0, self.params.window)
         elif self.params.adapt is Adaptation.SCALE:
-            R = R * (window.factors[:, None] * window.factors)
+            R = scaled_R(R, window.factors[_BLOCKS])
         return floored(R, self._R0, self.params.r_floor)
 
     def base(self, R: Array, window: NoiseWindow) -> Array:
         """The base R of an R that ``of`` returned with this window."""
         s = window.factors if self.params.adapt is Adaptation.SCALE else _ONES
-        return np.asarray(R / (s[:, None] * s))
+        return scaled_R(R, 1.0 / s[_BLOCKS])
 
     def rescaled(self, R: Array, before: NoiseWindow, after: NoiseWindow) -> Array:
         """An R that ``of`` returned with one window, as it is with the factors and the rise of
@@ -315,7 +293,7 @@ class Noise:
         s = after.rise.factor / before.rise.factor
         if self.params.adapt is Adaptation.SCALE:
             s = s * (after.factors / before.factors)
-        return np.asarray(R * (s[:, None] * s))
+        return scaled_R(R, s[_BLOCKS])
 
     def dof(self, alignment: Alignment) -> float:
         """Degrees of freedom of the base R as an estimate from the residuals of the scan, inf where

@@ -42,8 +42,8 @@ from avsreplay.estimate.disturbance_density import (
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.dynamics import torque_density
 from avsreplay.estimate.error_state import RHO, VEL
-from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.normal_points import PositionRows, error_parts
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.geometry import Array
 
 MOST_NORMAL_POINTS = 24  # normal points of an estimate

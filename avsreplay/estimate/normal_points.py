@@ -18,7 +18,7 @@ from avsreplay.estimate.chart import Chart, to_state
 from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.geometry import Array
 from avsreplay.records import Manoeuvre
 
@@ -88,8 +88,9 @@ def position_rows(
     w = weights / np.trace(C, axis1=1, axis2=2)
     w /= np.repeat(np.add.reduceat(w, first), np.diff(first, append=len(t)))
     R, middle = geometry.matrix(poses.q), (first + np.append(first[1:], len(t))) // 2
+    placed = poses.t - (R @ poses.shifts[:, 3:, None])[:, :, 0]
     seen, turns, times = (
-        np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (poses.t, R, t)
+        np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (placed, R, t)
     )
     noise = np.add.reduceat((w * w)[:, None, None] * (R @ C @ np.swapaxes(R, 1, 2)), first)
     root = np.linalg.inv(cholesky_root(np.swapaxes(R[middle], 1, 2) @ noise @ R[middle]))
@@ -149,9 +150,11 @@ def normal_points(
     reference motion.
 
     Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's
-    pose at their mean instant, corrected by the mean of their differences from it. Its covariance
-    is the inverse of the sum of their information. The difference of two solutions of the motion
-    changes little over such a turn, so the fit to the normal points is the fit to the poses.
+    pose at their mean instant, corrected by their mean difference from it. The mean weighted by
+    their information may be far from there along directions that none of them determines; the
+    difference of the two is the ``shift``. The covariance is the inverse of the sum of their
+    information. The difference of two solutions of the motion changes little over such a turn, so
+    the fit to the normal points is the fit to the poses.
     Satellite laser ranging reduces its observations to normal points in the same way.
 
     Args:
@@ -166,7 +169,7 @@ def normal_points(
         return poses
     first = _parts(rate * (poses.times_s - poses.times_s[0]), most)
     d = poses.residuals(Problem(poses, _ANY_PRIOR, factors), reference)
-    white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
+    white = poses.whitened(d, factors)
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
     sizes = np.diff(first, append=n)
     counts = sizes if poses.counts is None else np.add.reduceat(poses.counts, first)
@@ -180,8 +183,10 @@ def normal_points(
     times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
     x = to_state(reference)
     q_ab, centre = rotation_path(x).at(times)[0], translated(x, times, poses.arc)[0]
-    q, t = _motion.corrected_poses(x.flat, q_ab, centre, geometry.exp(-mean[:, :3]), mean[:, 3:])
-    return Poses(times, q, t, 0.5 * (C + np.swapaxes(C, 1, 2)), counts, shares, within, poses.arc)
+    off = np.add.reduceat(weights[:, None] * d, first) / np.add.reduceat(weights, first)[:, None]
+    q, t = _motion.corrected_poses(x.flat, q_ab, centre, geometry.exp(-off[:, :3]), off[:, 3:])
+    C = 0.5 * (C + np.swapaxes(C, 1, 2))
+    return Poses(times, q, t, C, counts, shares, within, poses.arc, mean - off)
 
 
 def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
@@ -194,9 +199,7 @@ def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
     """
     first = np.clip(np.arange(len(d)) - _NEIGHBOURS // 2, 0, max(0, len(d) - _NEIGHBOURS))
     around = d[np.minimum(first[:, None] + np.arange(_NEIGHBOURS), len(d) - 1)]
-    white = (poses.root @ ((d - np.median(around, axis=1)) / np.repeat(factors, 3))[:, :, None])[
-        :, :, 0
-    ]
+    white = poses.whitened(d - np.median(around, axis=1), factors)
     squares = (white * white).sum(axis=1)
     return np.asarray(squares > _GROSS_RATIO * max(float(np.median(squares)), 6.0))
 

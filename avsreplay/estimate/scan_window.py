@@ -21,10 +21,11 @@ from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
 from avsreplay.estimate.dynamics import process_noise
-from avsreplay.estimate.error_state import REACHED, rotation
+from avsreplay.estimate.error_state import LARGEST_MOVE, REACHED, rotation
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
-from avsreplay.estimate.noise import cholesky_root, correlated_noise
+from avsreplay.estimate.noise import correlated_noise
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.scan_points import ScanPoints, scan_points
 from avsreplay.estimate.track import NO_CHANGE, Epoch
@@ -272,6 +273,7 @@ def possible_change(
         [size * each for each in priors.scales[:-1] for size in _SIZES],
         scale,
         last[-1].innovation.share,
+        LARGEST_MOVE,
     )
     if not ratio > 1.0:
         return 0.0, NO_CHANGE

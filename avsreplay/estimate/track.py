@@ -17,8 +17,9 @@ from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, ModelErrors, line_of_sight_1s
 from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.initialise import BatchResult, PoseFix
-from avsreplay.estimate.noise import NoiseWindow
+from avsreplay.estimate.noise import NO_INFLATION, NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
+from avsreplay.estimate.pose_noise import scaled_R
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
@@ -80,8 +81,8 @@ class Epoch:
     def white(self) -> Array:
         """The (6,) whitened innovation; computed once."""
         if (found := self._white) is None:
-            roots, _ = _motion.roots(self.innovation.S[None])
-            object.__setattr__(self, "_white", found := roots[0] @ self.innovation.alpha)
+            root = _motion.roots(self.innovation.S[None])[0]
+            object.__setattr__(self, "_white", found := root @ self.innovation.alpha)
         return found
 
     @property
@@ -89,13 +90,10 @@ class Epoch:
         """Its transition, innovation and gain as ``_motion.change`` takes them; computed once."""
         if (found := self._used) is None:
             prior, seen, inflation = self.prediction, self.innovation, self.track.inflation
-            factors = (
-                (1.0 / seen.weight,) * 2
-                if inflation is None
-                else tuple((inflation / seen.weight).tolist())
-            )
+            each = (NO_INFLATION if inflation is None else inflation) / seen.weight
+            noise = scaled_R(seen.R, np.sqrt(each))
             H, P = prior.H, prior.belief.P
-            found = _motion.used(prior.Phi, P, H, seen.alpha, seen.S, seen.R, factors)
+            found = _motion.used(prior.Phi, P, H, seen.alpha, seen.S, seen.R, noise)
             object.__setattr__(self, "_used", found)
         return found
 
@@ -254,7 +252,13 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
     adjoint[3:, :3] = -G.R.T @ geometry.skew(G.t)
     x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
     fixes = tuple(
-        replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes
+        replace(
+            fix,
+            T_ac=fix.T_ac @ G,
+            C=adjoint @ fix.C @ adjoint.T,
+            shift=None if fix.shift is None else adjoint @ fix.shift,
+        )
+        for fix in track.fixes
     )
     belief = replace(track.belief, x=x)
     anew = track.changed(belief=belief, fixes=fixes, older=(), mode="start", batch=None)

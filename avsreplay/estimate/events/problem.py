@@ -32,7 +32,7 @@ from avsreplay.estimate.events.kinds import (
     Kind,
 )
 from avsreplay.estimate.events.linear import LinearModel, Passed, passed
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.pose_noise import cholesky_root
 from avsreplay.geometry import Array
 
 _TURN_RAD = 0.4  # largest turn over which effects of accelerations are integrated by Simpson's rule
@@ -166,7 +166,7 @@ class Problem:
             before = evidence
             most = _MOST_FIRST if round_ < _FIRST_ROUNDS < rounds else np.inf
             charts = self._moved(charts, found)
-            levels = self._improved(levels, model, found, flow, wrong, most)
+            levels = self._improved(levels, found, flow, wrong, most)
             wrong = self._wrong(model, found, wrong)
         flow = self._linearised(charts, events)
         model = self._model(flow, levels, events, wrong)
@@ -209,7 +209,6 @@ class Problem:
     def _improved(
         self,
         levels: Levels,
-        model: LinearModel,
         found: Passed,
         flow: _Flow,
         wrong: NDArray[np.bool_],
@@ -221,11 +220,13 @@ class Problem:
         the variance is multiplied by their ratio.
         """
         on = ~wrong
-        u, D, R = found.error[on], found.weight[on], model.R[on]
+        u, D = found.error[on], found.weight[on]
+        half = (self.root * np.repeat(levels.factors, 3))[on]  # R = half half'
         factors = np.empty(2)
         for b, part in enumerate((slice(0, 3), slice(3, 6))):
-            squares = np.sum(u[:, part, None] * (R[:, part, part] @ u[:, part, None]))
-            traces = np.sum(D[:, part, part] * R[:, part, part])
+            own = half[:, :, part]
+            squares = np.sum((u[:, None] @ own) ** 2)
+            traces = np.sum(own * (D @ own))
             prior = _PRIOR_DOF / levels.factors[b] ** 2
             factors[b] = levels.factors[b] * np.sqrt((squares + prior) / (traces + _PRIOR_DOF))
             factors[b] = min(factors[b], most)
@@ -269,8 +270,9 @@ class Problem:
                 P0 += added
         factors = np.repeat(levels.factors, 3)
         H = flow.H.copy()
-        H[:, :, COLOUR] = factors[:, None] * self.single * np.repeat(np.sqrt(levels.common), 3)
-        R = factors[:, None] * self.poses.C * factors
+        H[:, :, COLOUR] = self.single * (factors * np.repeat(np.sqrt(levels.common), 3))
+        half = self.root * factors
+        R = half @ half.swapaxes(1, 2)
         return LinearModel(flow.F, flow.b, Q, flow.z, H, R, ~wrong, flow.m0, P0)
 
     @staticmethod
@@ -304,6 +306,7 @@ class Problem:
         z, H = np.empty((count, 6)), np.zeros((count, 6, STATES))
         z[:, :3] = -geometry.log(geometry.multiply(geometry.conjugate(self.poses.q), q))
         z[:, 3:] = -(back @ (p - self.poses.t)[:, :, None])[:, :, 0]
+        z -= self.poses.shifts
         H[:, :3, ETA], H[:, 3:, POSITION] = 2.0 * np.eye(3), back
         line = p / np.maximum(np.linalg.norm(p, axis=1), 1e-300)[:, None]
         H[:, 3:, OFFSET] = back @ line[:, :, None]

@@ -260,7 +260,7 @@ def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) 
     """A pose at each place: the mean of those nearest to it, about the motion from its chart."""
     middle = 0.5 * (poses.times_s[places[1:]] + poses.times_s[places[:-1]])
     bounds = np.concatenate([[0], np.searchsorted(poses.times_s, middle), [len(poses)]])
-    q, t, C, counts = [], [], [], []
+    q, t, C, counts, shifts = [], [], [], [], []
     for k, chart in enumerate(charts):
         part = np.arange(bounds[k], bounds[k + 1])
         since = poses.times_s[part] - poses.times_s[places[k]]
@@ -270,14 +270,17 @@ def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) 
         theta = geometry.log(geometry.multiply(geometry.conjugate(poses.q[part]), flat[:, :4]))
         back = geometry.matrix(poses.q[part]).swapaxes(1, 2)
         d = np.hstack([theta, (back @ (flat[:, 7:10] - poses.t[part])[:, :, None])[:, :, 0]])
+        d += poses.shifts[part]
         away = d - np.median(d, axis=0)
         squares = np.einsum("ki,kij,kj->k", away, np.linalg.inv(poses.C[part]), away)
         good = squares <= _GROSS * max(1.0, float(np.median(squares)) / 6.0)
         info = np.linalg.inv(poses.C[part][good])
         mean_C = np.linalg.inv(info.sum(axis=0))
         mean = mean_C @ (info @ d[good][:, :, None]).sum(axis=0)[:, 0]
-        q.append(geometry.multiply(chart.q_ac, geometry.exp(-mean[:3])))
-        t.append(chart.t_a - geometry.matrix(q[-1]) @ mean[3:])
+        off = d[good].mean(axis=0)
+        q.append(geometry.multiply(chart.q_ac, geometry.exp(-off[:3])))
+        t.append(chart.t_a - geometry.matrix(q[-1]) @ off[3:])
+        shifts.append(mean - off)
         C.append(0.5 * (mean_C + mean_C.T))
         counts.append(int(good.sum()))
     shares = None if poses.shares is None else poses.shares[places]
@@ -289,6 +292,7 @@ def _averaged(poses: Poses, places: NDArray[np.int64], charts: Sequence[Chart]) 
         np.array(counts),
         shares,
         arc=poses.arc,
+        shift=np.array(shifts),
     )
 
 

@@ -185,7 +185,7 @@ Numpy forecast_of(const Mean& mean, const Matrix<DIM, DIM>& P, const Three& torq
 // State and P, once a pose has been seen.
 nb::tuple correct_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Matrix<SEEN, DIM>& H,
                      const Vector<SEEN>& alpha, const Matrix<SEEN, SEEN>& S,
-                     const Matrix<SEEN, SEEN>& R, const Two& colour) {
+                     const Matrix<SEEN, SEEN>& R, const Matrix<SEEN, SEEN>& noise) {
   State x = state(mean);
   Pose seen;
   Square P;
@@ -194,7 +194,7 @@ nb::tuple correct_of(const Mean& mean, const Matrix<DIM, DIM>& P0, const Matrix<
   std::memcpy(seen.H, H.data(), sizeof seen.H);
   std::memcpy(seen.S, S.data(), sizeof seen.S);
   std::memcpy(seen.R, R.data(), sizeof seen.R);
-  correct(x, P, seen, colour.data());
+  correct(x, P, seen, as<double[SEEN][SEEN]>(noise.data()));
   return nb::make_tuple(flat(x), made(P));
 }
 
@@ -249,14 +249,14 @@ constexpr int USED = sizeof(Used) / sizeof(double);
 
 // The numbers of a scan that was used, for change_of.
 Numpy used_of(const Matrix<DIM, DIM>& Phi, const Matrix<DIM, DIM>& P, const Matrix<SEEN, DIM>& H, const Vector<SEEN>& alpha,
-              const Six& S, const Six& R, const Two& colour) {
+              const Six& S, const Six& R, const Six& noise) {
   Pose pose;
   Used used;
   std::memcpy(pose.H, H.data(), sizeof pose.H);
   std::memcpy(pose.alpha, alpha.data(), sizeof pose.alpha);
   std::memcpy(pose.S, S.data(), sizeof pose.S);
   std::memcpy(pose.R, R.data(), sizeof pose.R);
-  seen_at(as<Square>(P.data()), pose, colour.data(), used);
+  seen_at(as<Square>(P.data()), pose, six(noise), used);
   std::memcpy(used.Phi, Phi.data(), sizeof used.Phi);
   double* to;
   Numpy out = array({(size_t)USED}, &to);
@@ -266,11 +266,11 @@ Numpy used_of(const Matrix<DIM, DIM>& Phi, const Matrix<DIM, DIM>& P, const Matr
 
 // The likelihood ratio of a change in the last scans, and the second moments (20, 20) of the error it would cause.
 nb::tuple change_of(const Matrix<-1, USED>& scans, const Two& one_sigma, const std::vector<double>& sizes, double scale,
-                    double share) {
+                    double share, double most) {
   if (sizes.empty() || !scans.shape(0)) throw std::invalid_argument("a change needs a size and a scan");
   Square moments;
   const double ratio = change_ratio(reinterpret_cast<const Used*>(scans.data()), (int)scans.shape(0), one_sigma.data(), sizes,
-                                    scale, share, moments);
+                                    scale, share, most, moments);
   return nb::make_tuple(ratio, made(moments));
 }
 
@@ -416,10 +416,10 @@ struct Poses {
 };
 
 void create_poses(Poses* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
-                  const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info) {
+                  const Matrix<-1, SEEN>& shift, const Matrix<-1, SEEN, SEEN>& root) {
   const size_t n = t.shape(0);
-  if (q.shape(0) != n || p.shape(0) != n || root.shape(0) != n || info.shape(0) != n)
-    throw std::invalid_argument("times, q, p, root and info must be equally many");
+  if (q.shape(0) != n || p.shape(0) != n || shift.shape(0) != n || root.shape(0) != n)
+    throw std::invalid_argument("times, q, p, shift and root must be equally many");
   std::vector<Measured>& poses = (new (self) Poses{std::vector<Measured>(n)})->each;
   for (size_t k = 0; k < n; ++k) {
     Measured& pose = poses[k];
@@ -427,8 +427,8 @@ void create_poses(Poses* self, const Times& t, const Matrix<-1, 4>& q, const Mat
     pose.speed = {{{pose.t, 0, 0}, {0, pose.t, 0}, {0, 0, pose.t}}};
     std::memcpy(&pose.q, q.data() + 4 * k, sizeof pose.q);
     std::memcpy(&pose.p, p.data() + 3 * k, sizeof pose.p);
+    std::memcpy(pose.shift, shift.data() + SEEN * k, sizeof pose.shift);
     std::memcpy(pose.root, root.data() + SEEN * SEEN * k, sizeof pose.root);
-    std::memcpy(pose.info, info.data() + 18 * k, sizeof pose.info);
   }
 }
 
@@ -733,23 +733,17 @@ nb::tuple carry_of(const Mixture& mixture, const Step& step, const Weighed& seen
   return nb::make_tuple(std::move(after), misfits);
 }
 
-// Of covariances C (n, 6, 6): roots (n, 6, 6) with root C root' = 1, and the inverses (n, 2, 3, 3) of the diagonal blocks.
-nb::tuple roots_of(const Matrix<-1, SEEN, SEEN>& C) {
+// Of covariances C (n, 6, 6): lower triangular roots (n, 6, 6) with root C root' = 1.
+Numpy roots_of(const Matrix<-1, SEEN, SEEN>& C) {
   const size_t n = C.shape(0);
-  double *root, *info;
-  Numpy first = array({n, SEEN, SEEN}, &root), second = array({n, 2, 3, 3}, &info);
+  double* root;
+  Numpy out = array({n, SEEN, SEEN}, &root);
   for (size_t k = 0; k < n; ++k) {
     const auto& one = as<double[SEEN][SEEN]>(C.data() + SEEN * SEEN * k);
     if (!inverse_root(one, *reinterpret_cast<double(*)[SEEN][SEEN]>(root + SEEN * SEEN * k)))
       throw std::invalid_argument("a covariance is not positive definite");
-    for (int block = 0; block < 2; ++block) {
-      double A[3][3];
-      for (int r = 0; r < 3; ++r) std::memcpy(A[r], &one[3 * block + r][3 * block], sizeof A[r]);
-      const M3 found = inverse(A);
-      std::memcpy(info + 18 * k + 9 * block, &found, sizeof found);
-    }
   }
-  return nb::make_tuple(first, second);
+  return out;
 }
 
 bool above_of(const Matrix<DIM, DIM>& P, double least) { return above(as<Square>(P.data()), least); }
@@ -843,7 +837,7 @@ NB_MODULE(_motion, m) {
   m.def("follow", &follow, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("push"), nb::arg("times"),
         nb::arg("drive") = Three{0, 0, 0});
   m.def("correct", &correct_of, nb::arg("x"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
-        nb::arg("colour"));
+        nb::arg("noise"));
   m.def("forecast", &forecast_of, nb::arg("x"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
   m.def("mixture_forecast", &mixture_forecast_of, nb::arg("mixture"), nb::arg("weights"), nb::arg("torque"),
         nb::arg("published"), nb::arg("force"), nb::arg("times"), nb::arg("origin_c"));
@@ -859,8 +853,9 @@ NB_MODULE(_motion, m) {
   m.def("shifted_mean", &shifted_mean, nb::arg("x"), nb::arg("to"));
   m.def("shifted", &shifted_of, nb::arg("x"), nb::arg("P"), nb::arg("to"));
   m.def("used", &used_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
-        nb::arg("colour"));
-  m.def("change", &change_of, nb::arg("scans"), nb::arg("one_sigma"), nb::arg("sizes"), nb::arg("scale"), nb::arg("share"));
+        nb::arg("noise"));
+  m.def("change", &change_of, nb::arg("scans"), nb::arg("one_sigma"), nb::arg("sizes"), nb::arg("scale"), nb::arg("share"),
+        nb::arg("most"));
   m.def("after_changes", &after_changes, nb::arg("late"), nb::arg("which"), nb::arg("impulses"), nb::arg("instants"));
   m.def("evidence", &evidence_of, nb::arg("M"), nb::arg("white"), nb::arg("size"));
   m.def("log_ratio", &log_ratio_of, nb::arg("A"), nb::arg("b"));
@@ -907,7 +902,7 @@ NB_MODULE(_motion, m) {
   m.def("nees", &nees_of, nb::arg("x"), nb::arg("truth"), nb::arg("P"),
         nb::arg("R_nb"), nb::arg("q_bn"));
   nb::class_<Poses>(m, "Poses")
-      .def("__init__", &create_poses, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"));
+      .def("__init__", &create_poses, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("shift"), nb::arg("root"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("poses"), nb::arg("mean"), nb::arg("prior_info"))
       .def("paths", &set_paths, nb::arg("paths"))

@@ -56,7 +56,7 @@ void evidence(const double A[SEEN][SEEN], const double b[SEEN], const double F[D
 }  // namespace
 
 double change_ratio(const Used* scans, int count, const double one_sigma[2], const std::vector<double>& sizes, double scale,
-                    double share, double P[DIM][DIM]) {
+                    double share, double most, double P[DIM][DIM]) {
   std::vector<Candidate> found;
   for (int k = 0; k < count; ++k) {
     const double wider = scale * (1 + (count - 1 - k) * share);  // errors that the scans from k on have in common
@@ -67,7 +67,7 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
           F[r][c] = scans[k].Phi[r][c < 3 ? 3 + c : 6 + c] * (r < 3 || (r >= 6 && r < 9) ? part : 1.0);
       for (int j = k; j < count; ++j) {
         const Used& scan = scans[j];
-        double M[SEEN][SEEN] = {}, SM[SEEN][SEEN] = {};
+        double M[SEEN][SEEN] = {}, white[SEEN][SEEN + 1] = {};  // of unit variance: M, then the innovation
         if (j > k) {
           double before[DIM][SEEN];
           std::memcpy(before, F, sizeof F);
@@ -80,12 +80,14 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
           for (int i = 0; i < DIM; ++i)
             for (int c = 0; c < SEEN; ++c) M[r][c] += scan.H[r][i] * F[i][c];
         for (int r = 0; r < SEEN; ++r)
-          for (int i = 0; i < SEEN; ++i)
-            for (int c = 0; c < SEEN; ++c) SM[r][c] += scan.info[r][i] * M[i][c];
+          for (int i = 0; i <= r; ++i) {
+            for (int c = 0; c < SEEN; ++c) white[r][c] += scan.root[r][i] * M[i][c];
+            white[r][SEEN] += scan.root[r][i] * scan.alpha[i];
+          }
         for (int r = 0; r < SEEN; ++r)
           for (int i = 0; i < SEEN; ++i) {
-            b[r] += SM[i][r] * scan.alpha[i] / wider;
-            for (int c = 0; c < SEEN; ++c) A[r][c] += M[i][r] * SM[i][c] / wider;
+            b[r] += white[i][r] * white[i][SEEN] / wider;
+            for (int c = 0; c < SEEN; ++c) A[r][c] += white[i][r] * white[i][c] / wider;
           }
         for (int r = 0; r < DIM; ++r)  // what the update leaves of the error
           for (int i = 0; i < SEEN; ++i)
@@ -93,18 +95,23 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
       }
       for (int kind = 0; kind < 2; ++kind)
         for (const double size : sizes) {
+          double moved = 0;
+          for (const auto& row : F)
+            for (int c = 3 * kind; c < 3 * kind + 3; ++c) moved = std::max(moved, std::fabs(row[c]) * size * one_sigma[kind]);
+          if (!(moved <= most)) continue;
           Candidate one;
           evidence(A, b, F, 3 * kind, size * one_sigma[kind], one);
           found.push_back(one);
         }
     }
   }
+  std::memset(P, 0, DIM * DIM * sizeof(double));
+  if (found.empty()) return 0;
   double top = found[0].log_ratio, total = 0;
   for (const Candidate& one : found) top = std::max(top, one.log_ratio);
   top = std::min(top, MOST_LOG_ODDS);
   const double none = exp_of(-top);
   for (Candidate& one : found) total += one.log_ratio = exp_of(std::min(one.log_ratio - top, 0.0));
-  std::memset(P, 0, DIM * DIM * sizeof(double));
   for (const Candidate& one : found) {
     const double weight = (one.log_ratio - none) / total;  // a change as likely as before the scans adds nothing
     if (!(weight > 0)) continue;

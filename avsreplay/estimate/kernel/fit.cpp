@@ -135,12 +135,15 @@ double Problem::residual(const Measured& pose, const State& x, const Turn& turn,
   V3 off = centre + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
   if (const double since = pose.t - push.onset; since > 0) off = off + 0.5 * since * since * vector(push.u + 3);
   const V3 v = transposed(matrix(pose.q)) * off;
-  std::memcpy(d, theta.x, sizeof theta.x);
-  std::memcpy(d + 3, v.x, sizeof v.x);
+  for (int k = 0; k < 3; ++k) {
+    d[k] = theta.x[k] + pose.shift[k];
+    d[k + 3] = v.x[k] + pose.shift[k + 3];
+  }
   double chi2 = 0;
   for (int r = 0; r < SEEN; ++r) {
     double e = 0;
-    for (int c = 0; c <= r; ++c) e += pose.root[r][c] * (d[c] / factors[c >= 3]);
+    for (int c = 0; c <= r; ++c) e += pose.root[r][c] * d[c];
+    e /= factors[r >= 3];
     chi2 += e * e;
   }
   return chi2;
@@ -267,7 +270,8 @@ void Problem::reweigh() {
     double chi2 = 0;
     for (int r = 0; r < SEEN; ++r) {
       double e = 0;
-      for (int c = 0; c <= r; ++c) e += poses[k].root[r][c] * (d[SEEN * k + c] / factors[c >= 3]);
+      for (int c = 0; c <= r; ++c) e += poses[k].root[r][c] * d[SEEN * k + c];
+      e /= factors[r >= 3];
       chi2 += e * e;
     }
     sum += robust(chi2, &weights[k]);
@@ -282,7 +286,7 @@ void Problem::whitened(size_t k, double e[SEEN], Rows H) const {
     e[r] = 0;
     for (int c = 0; c < DIM; ++c) H[r][c] = 0;
     for (int i = 0; i <= r; ++i) {
-      const double f = w * poses[k].root[r][i] / factors[i >= 3];
+      const double f = w * poses[k].root[r][i] / factors[r >= 3];
       e[r] += f * d[SEEN * k + i];
       for (int c = 0; c < DIM; ++c) H[r][c] += f * jacobian[DIM * i + c];
     }
@@ -300,7 +304,7 @@ void Problem::in_steps(size_t k, double e[SEEN], double H[SEEN][N]) const {
     for (int c = DIM; c < N; ++c) {
       H[r][c] = 0;
       for (int i = 0; i <= r; ++i)
-        H[r][c] += w * poses[k].root[r][i] / factors[i >= 3] * Ju[PUSHED * (SEEN * k + i) + c - DIM];
+        H[r][c] += w * poses[k].root[r][i] / factors[r >= 3] * Ju[PUSHED * (SEEN * k + i) + c - DIM];
     }
   }
 }
@@ -356,7 +360,7 @@ bool Problem::bent(const Square M, const Square A, double step[DIM], std::vector
     const double w = std::sqrt(weights[k]);
     for (int r = 0; r < SEEN; ++r) {
       double one = 0;
-      for (int i = 0; i <= r; ++i) one += w * poses[k].root[r][i] / factors[i >= 3] * second[i];
+      for (int i = 0; i <= r; ++i) one += w * poses[k].root[r][i] / factors[r >= 3] * second[i];
       for (int c = 0; c < DIM; ++c) g[c] += H[r][c] * one;
     }
   }
@@ -417,16 +421,12 @@ void Problem::absorbed(const Square P, double out[2]) const {
   congruent(Tt, P, Pe);
   out[0] = out[1] = 0;
   for (size_t k = 0; k < poses.size(); ++k)
-    for (int block = 0; block < 2; ++block) {
-      const M3& info = poses[k].info[block];
-      const double* rows = &J[DIM * (SEEN * k + 3 * block)];
-      double JP[3][DIM] = {}, s = 0;
-      for (int i = 0; i < 3; ++i)
-        for (int m = 0; m < DIM; ++m)
-          for (int c = 0; c < DIM; ++c) JP[i][c] += rows[DIM * i + m] * Pe[m][c];
-      for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) s += info.x[i][j] * dot(JP[i], rows + DIM * j, DIM);
-      out[block] += weights[k] * s;
+    for (int r = 0; r < SEEN; ++r) {
+      double row[DIM] = {}, s = 0;
+      for (int i = 0; i <= r; ++i)
+        for (int c = 0; c < DIM; ++c) row[c] += poses[k].root[r][i] * J[DIM * (SEEN * k + i) + c];
+      for (int m = 0; m < DIM; ++m) s += row[m] * dot(Pe[m], row, DIM);
+      out[r >= 3] += weights[k] * s;
     }
 }
 
@@ -538,7 +538,7 @@ double Driven::step(double damping) {
       const double w = std::sqrt(weights[k]);
       for (int r = 0; r < SEEN; ++r) {
         double probed = 0;
-        for (int i = 0; i <= r; ++i) probed += w * poses[k].root[r][i] / factors[i >= 3] * trial[SEEN * k + i];
+        for (int i = 0; i <= r; ++i) probed += w * poses[k].root[r][i] / factors[r >= 3] * trial[SEEN * k + i];
         const double second = 2 / DIFFERENCE * ((probed - e[r]) / DIFFERENCE - dot(H[r], step, JOINT));
         for (int c = 0; c < JOINT; ++c) a[c] -= 0.5 * H[r][c] * second;
       }

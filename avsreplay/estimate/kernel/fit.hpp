@@ -12,15 +12,14 @@ namespace avs {
 using Square = double[DIM][DIM];
 using Rows = double[SEEN][DIM];
 
-// A measured pose T_ac: time since the epoch, the inverse Cholesky factor of its covariance, and the information of its
-// attitude and of its position by themselves.
+// A measured pose T_ac: time since the epoch, and the inverse Cholesky factor of its covariance.
 struct Measured {
   double t;
   M3 place = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, speed = {};  // centre of mass by position and velocity at the epoch
   Quad q;
   V3 p;
+  double shift[SEEN];  // added to the residual: the mean of the poses that a normal point stands for
   double root[SEEN][SEEN];
-  M3 info[2];
 };
 
 // A pseudo-measurement row . (chart - centre) = target that fixes one direction.
@@ -44,7 +43,9 @@ class Problem {
   Square prior_info;
   Pin pin;
   bool pinned = false;
-  double factors[2] = {1, 1};  // on the noise of attitude and position
+  // On the standard deviations of attitude, and of position given the attitude: they divide the rows of root d. A
+  // direction that a pose does not determine thus stays the same (pose_noise.py).
+  double factors[2] = {1, 1};
   bool redescend = true;  // Cauchy's weights, else Huber's
   double gate = std::numeric_limits<double>::infinity();  // chi-square from which a pose is an outlier
   Push push;
@@ -68,7 +69,8 @@ class Problem {
   void whitened(size_t k, double e[SEEN], Rows H) const;
   // Levenberg-Marquardt from the present linearisation; returns whether the stopping rule was met within `most` steps.
   bool descend(int most, double gain_tol, int& steps);
-  // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
+  // Weighted sum over the poses of the trace of root J P J' root', of the rows of attitude and of position; P in chart
+  // steps.
   void absorbed(const Square P, double out[2]) const;
   // Kalman pass over the poses with process noise since an instant [s], from y and P in N = 20 chart steps, or in 27 unknowns
   // with acceleration and onset. The error states of attitude to velocity are in other coordinates than P where two

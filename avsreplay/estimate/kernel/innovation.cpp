@@ -2,7 +2,9 @@
 
 #include <cmath>
 #include <cstring>
+#include <stdexcept>
 
+#include "covariance.hpp"
 #include "elimination.hpp"
 
 namespace avs {
@@ -82,20 +84,21 @@ double squared_traces(const double part[SEEN][SEEN], const double total[SEEN][SE
 
 void block_squares(const double R[SEEN][SEEN], const double e[SEEN], const double C[SEEN][SEEN], double squares[2],
                    double known[2]) {
-  for (int block = 0; block < 2; ++block) {
-    const int from = 3 * block;
-    double A[3][3], B[3][4];  // the block of C, then e
-    for (int r = 0; r < 3; ++r) {
-      std::memcpy(A[r], &R[from + r][from], sizeof A[r]);
-      std::memcpy(B[r], &C[from + r][from], sizeof A[r]);
-      B[r][3] = e[from + r];
+  const auto place = [](int k) { return (k + 3) % SEEN; };  // of attitude before position
+  double exchanged[SEEN][SEEN], root[SEEN][SEEN];
+  for (int r = 0; r < SEEN; ++r)
+    for (int c = 0; c < SEEN; ++c) exchanged[r][c] = R[place(r)][place(c)];
+  if (!inverse_root(exchanged, root)) throw std::invalid_argument("a covariance is not positive definite");
+  squares[0] = squares[1] = known[0] = known[1] = 0;
+  for (int r = 0; r < SEEN; ++r) {
+    const int block = r < 3;
+    double white = 0, variance = 0;
+    for (int i = 0; i <= r; ++i) {
+      white += root[r][i] * e[place(i)];
+      for (int j = 0; j <= r; ++j) variance += root[r][i] * C[place(i)][place(j)] * root[r][j];
     }
-    solve<3, 4>(A, B);
-    squares[block] = known[block] = 0;
-    for (int r = 0; r < 3; ++r) {
-      squares[block] += e[from + r] * B[r][3];
-      known[block] += B[r][r];
-    }
+    squares[block] += white * white;
+    known[block] += variance;
   }
 }
 

@@ -23,7 +23,7 @@ double trace_of_ratio(const double part[SEEN][SEEN], const double total[SEEN][SE
 // tr B^2 + (tr B)^2 of B = total^-1 part.
 double squared_traces(const double part[SEEN][SEEN], const double total[SEEN][SEEN]);
 
-// Per block of three, e' R^-1 e and tr R^-1 C of the blocks of R and C.
+// Squares of e and the trace of C of the position given the attitude, and of the attitude, in units of R.
 void block_squares(const double R[SEEN][SEEN], const double e[SEEN], const double C[SEEN][SEEN], double squares[2],
                    double known[2]);
 

@@ -1,7 +1,9 @@
 // Gain and covariance of fixed size: plain sums in a fixed order.
 #include <cmath>
 #include <cstring>
+#include <stdexcept>
 
+#include "covariance.hpp"
 #include "elimination.hpp"
 #include "update.hpp"
 
@@ -51,32 +53,27 @@ void joseph(double P[W][W], const double H[SEEN][W], const double HP[SEEN][W], c
     for (int c = 0; c <= r; ++c) P[r][c] = P[c][r] = 0.5 * (X[r][c] + GK[r][c] + X[c][r] + GK[c][r]);
 }
 
-// R and S of a pose whose noise is widened by `colour`.
-void widened(const Pose& seen, const double colour[2], double R[SEEN][SEEN], double S[SEEN][SEEN]) {
+// S of a pose with the noise R in place of its own.
+void with_noise(const Pose& seen, const double R[SEEN][SEEN], double S[SEEN][SEEN]) {
   for (int r = 0; r < SEEN; ++r)
-    for (int c = 0; c < SEEN; ++c) {
-      R[r][c] = seen.R[r][c] * std::sqrt(colour[r < 3] * colour[c < 3]);
-      S[r][c] = seen.S[r][c] + (R[r][c] - seen.R[r][c]);
-    }
+    for (int c = 0; c < SEEN; ++c) S[r][c] = seen.S[r][c] + (R[r][c] - seen.R[r][c]);
 }
 
 }  // namespace
 
-void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2], Used& out) {
-  double R[SEEN][SEEN], S[SEEN][SEEN], HP[SEEN][DIM], one[SEEN][DIM] = {};
-  widened(pose, colour, R, S);
+void seen_at(const double P[DIM][DIM], const Pose& pose, const double R[SEEN][SEEN], Used& out) {
+  double S[SEEN][SEEN], HP[SEEN][DIM];
+  with_noise(pose, R, S);
   product<SEEN, DIM>(pose.H, P, HP);
   gain<DIM>(HP, S, out.Kt);
-  for (int r = 0; r < SEEN; ++r) one[r][r] = 1;
-  solve<SEEN, DIM>(pose.S, one);
-  for (int r = 0; r < SEEN; ++r) std::memcpy(out.info[r], one[r], sizeof out.info[r]);
+  if (!inverse_root(pose.S, out.root)) throw std::invalid_argument("a covariance is not positive definite");
   std::memcpy(out.H, pose.H, sizeof out.H);
   std::memcpy(out.alpha, pose.alpha, sizeof out.alpha);
 }
 
-void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]) {
-  double R[SEEN][SEEN], S[SEEN][SEEN], HP[SEEN][DIM], Kt[SEEN][DIM], d[DIM] = {};
-  widened(seen, colour, R, S);
+void correct(State& x, double P[DIM][DIM], const Pose& seen, const double R[SEEN][SEEN]) {
+  double S[SEEN][SEEN], HP[SEEN][DIM], Kt[SEEN][DIM], d[DIM] = {};
+  with_noise(seen, R, S);
   product<SEEN, DIM>(seen.H, P, HP);
   gain<DIM>(HP, S, Kt);
   for (int i = 0; i < SEEN; ++i)

@@ -31,24 +31,25 @@ struct Pose {
   double H[SEEN][DIM], alpha[SEEN], S[SEEN][SEEN], R[SEEN][SEEN];
 };
 
-// x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: measurement.py.
-void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]);
+// x and P once a pose has been seen with the noise R in place of its own, through the chart: measurement.py.
+void correct(State& x, double P[DIM][DIM], const Pose& seen, const double R[SEEN][SEEN]);
 
-// A scan that was used: the transition since the one before, Jacobian and innovation of its pose, the inverse of the
-// innovation's covariance, and the transposed gain.
+// A scan that was used: the transition since the one before, Jacobian and innovation of its pose, the lower triangular root
+// with root S root' = 1 of the innovation's covariance, and the transposed gain.
 struct Used {
-  double Phi[DIM][DIM], H[SEEN][DIM], alpha[SEEN], info[SEEN][SEEN], Kt[SEEN][DIM];
+  double Phi[DIM][DIM], H[SEEN][DIM], alpha[SEEN], root[SEEN][SEEN], Kt[SEEN][DIM];
 };
 
-// The Used of a pose at a prior covariance P, its noise widened by `colour` in the update.
-void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2], Used& out);
+// The Used of a pose at a prior covariance P, the noise of the update being R in place of its own.
+void seen_at(const double P[DIM][DIM], const Pose& pose, const double R[SEEN][SEEN], Used& out);
 
 // Likelihood ratio of a change of rate or velocity within one of the intervals before the last scans, to none, and the
 // second moments P of the estimate's error after the last of them if there was one, from the changes that the scans have
 // made more likely. `one_sigma` is that of the rate and of the velocity, times each of the `sizes`; `scale` is the factor on
-// the covariance of the innovations, and `share` the part of it that scans have in common.
+// the covariance of the innovations, and `share` the part of it that scans have in common. A change that the updates let
+// grow beyond `most` is left out: it is not linear. The ratio is 0 without any other.
 double change_ratio(const Used* scans, int count, const double one_sigma[2], const std::vector<double>& sizes, double scale,
-                    double share, double P[DIM][DIM]);
+                    double share, double most, double P[DIM][DIM]);
 
 // y and P of W unknowns once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
 template <int W>
