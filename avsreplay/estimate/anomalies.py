@@ -435,15 +435,14 @@ class AnomalyTest:
         """Fit of the poses after a manoeuvre with the prior at its instant."""
         poses = poses_of(fixes, t_ns)
         inflation = np.ones(2) if track.inflation is None else track.inflation
-        window = track.window.factors
-        factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
+        plain = track.window.blocks
+        factors = plain * np.sqrt(inflation)
         fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
         now_ns, noise = fixes[-1].scan_ns, self.batch.noise_levels(track)
         found = BatchCovariance(fitted, ())
         after_s = (now_ns - t_ns) * 1e-9
         problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
         components = final_mixture(found, problem, latest, noise, now_ns, after_s)
-        plain = np.array([window[3], window[0]])
         return BatchResult(
             t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components
         )

@@ -416,8 +416,7 @@ def _noise_of(problem: Problem, every: Poses) -> tuple[Array, Array]:
     poses.
 
     The squared factor is the mean of the squares of root d, plus those of root J P^1/2, the part
-    that the fit absorbed; the
-    inflation is 1 + 2 sum of the residuals' autocorrelations.
+    that the fit absorbed; the inflation is 1 + 2 sum of the residuals' autocorrelations.
     """
     white = every.whitened(every.residuals(problem), problem.factors)
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)

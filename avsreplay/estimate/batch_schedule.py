@@ -309,10 +309,7 @@ class BatchSchedule:
         first = 0 if refines else oldest
         fixes, older = track.fixes[first:], (*track.older, *track.fixes[:first])[-MOST_FIXES:]
         if len(fixes) >= MOST_FIXES:
-            half, factors = (
-                MOST_FIXES // 2,
-                np.array([track.window.factors[3], track.window.factors[0]]),
-            )
+            half, factors = MOST_FIXES // 2, track.window.blocks
             fixes = (
                 joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors)
                 + fixes[half:]

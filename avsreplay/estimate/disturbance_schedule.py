@@ -160,7 +160,7 @@ class DisturbanceSchedule:
         self, track: Track, start: Chart, begun: tuple[float, Array] | None
     ) -> _Driven | None:
         """The test for a drift. ``begun``: onset and size of one that is known."""
-        factors = np.array([track.window.factors[3], track.window.factors[0]])
+        factors = track.window.blocks
         try:
             found = find_drift(
                 track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun

@@ -257,16 +257,24 @@ def gain(P: Array, H: Array, S: Array) -> Array:
     return np.asarray(np.linalg.solve(S, H @ P).T, dtype=np.float64)
 
 
+def update_noise(innovation: Innovation, inflation: Array) -> Array:
+    """The noise (6, 6) with which an update weights a pose: R of a single scan, widened.
+
+    ``inflation`` (2,) multiplies the variances of attitude and position: correlated errors carry
+    less information than white ones. The Cauchy weight of an outlier divides both. S of the
+    innovation itself is not widened.
+    """
+    return scaled_R(innovation.R, np.sqrt(inflation / innovation.weight))
+
+
 def constrained_update(
     prior: Belief, H: Array, innovation: Innovation, margin: float, inflation: Array
 ) -> tuple[Belief, int]:
     """Posterior of a healthy epoch (gamma 1) by the paper's gain, and how many sigma bounds acted.
 
-    ``inflation`` (2,) of attitude and position multiplies the variances of R: correlated errors
-    carry less information than white ones. S of the innovation itself is not inflated, because a
-    single scan has the noise R.
+    ``inflation`` (2,) of attitude and position is that of ``update_noise``.
     """
-    R = scaled_R(innovation.R, np.sqrt(inflation / innovation.weight))
+    R = update_noise(innovation, inflation)
     K = gain(prior.P, H, innovation.S + (R - innovation.R))
     betas, hits = sigma_bounds(prior.x.sigma, K[SIGMA] @ innovation.alpha, margin)
     if hits:
@@ -300,7 +308,7 @@ def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Arr
     the extension.
     """
     x, alpha, S, R = prior.x, innovation.alpha, innovation.S, innovation.R
-    noise = scaled_R(R, np.sqrt(inflation / innovation.weight))
+    noise = update_noise(innovation, inflation)
     mean, P = _motion.correct(x.flat, prior.P, H, alpha, S, R, noise)
     then = Belief(prior.t_ns, State.of(mean), P)
     if not isinstance(prior, DrivenBelief):

@@ -124,6 +124,11 @@ class NoiseWindow:
     level: tuple[float, float] = (1.0, 1.0)
     rise: NoiseRise = NO_RISE
 
+    @property
+    def blocks(self) -> Array:
+        """(2,) factors of attitude and position."""
+        return self.factors[_BLOCKS]
+
     @classmethod
     def empty(cls, rise: NoiseRise = NO_RISE) -> NoiseWindow:
         """A window without epochs."""
@@ -278,7 +283,7 @@ class Noise:
         if self.params.adapt is Adaptation.MATRIX:
             R = matrix_noise(window, self._R0, self.params.window)
         elif self.params.adapt is Adaptation.SCALE:
-            R = scaled_R(R, window.factors[_BLOCKS])
+            R = scaled_R(R, window.blocks)
         return floored(R, self._R0, self.params.r_floor)
 
     def base(self, R: Array, window: NoiseWindow) -> Array:

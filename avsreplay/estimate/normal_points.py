@@ -154,8 +154,8 @@ def normal_points(
     their information may be far from there along directions that none of them determines; the
     difference of the two is the ``shift``. The covariance is the inverse of the sum of their
     information. The difference of two solutions of the motion changes little over such a turn, so
-    the fit to the normal points is the fit to the poses.
-    Satellite laser ranging reduces its observations to normal points in the same way.
+    the fit to the normal points is the fit to the poses. Satellite laser ranging reduces its
+    observations to normal points in the same way.
 
     Args:
         poses: the measurements.

@@ -17,9 +17,9 @@ from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.common_errors import NO_MODEL_ERRORS, ModelErrors, line_of_sight_1s
 from avsreplay.estimate.frame import EstimatorFrame
 from avsreplay.estimate.initialise import BatchResult, PoseFix
+from avsreplay.estimate.measurement import update_noise
 from avsreplay.estimate.noise import NO_INFLATION, NoiseWindow
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
-from avsreplay.estimate.pose_noise import scaled_R
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, Moves
 
@@ -90,8 +90,7 @@ class Epoch:
         """Its transition, innovation and gain as ``_motion.change`` takes them; computed once."""
         if (found := self._used) is None:
             prior, seen, inflation = self.prediction, self.innovation, self.track.inflation
-            each = (NO_INFLATION if inflation is None else inflation) / seen.weight
-            noise = scaled_R(seen.R, np.sqrt(each))
+            noise = update_noise(seen, NO_INFLATION if inflation is None else inflation)
             H, P = prior.H, prior.belief.P
             found = _motion.used(prior.Phi, P, H, seen.alpha, seen.S, seen.R, noise)
             object.__setattr__(self, "_used", found)

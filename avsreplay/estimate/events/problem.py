@@ -221,7 +221,7 @@ class Problem:
         """
         on = ~wrong
         u, D = found.error[on], found.weight[on]
-        half = (self.root * np.repeat(levels.factors, 3))[on]  # R = half half'
+        half = self._noise_root(levels)[on]
         factors = np.empty(2)
         for b, part in enumerate((slice(0, 3), slice(3, 6))):
             own = half[:, :, part]
@@ -246,6 +246,10 @@ class Problem:
             densities.append(max(value * np.sqrt(ratio), _LEAST_DENSITY))
         return Levels(factors, common, *densities)
 
+    def _noise_root(self, levels: Levels) -> Array:
+        """(k, 6, 6) roots of the noise R of each pose, R = root root'."""
+        return np.asarray(self.root * np.repeat(levels.factors, 3))
+
     def _model(
         self,
         flow: _Flow,
@@ -268,10 +272,9 @@ class Problem:
                 Q[event.knot] += added
             else:
                 P0 += added
-        factors = np.repeat(levels.factors, 3)
-        H = flow.H.copy()
-        H[:, :, COLOUR] = self.single * (factors * np.repeat(np.sqrt(levels.common), 3))
-        half = self.root * factors
+        H, half = flow.H.copy(), self._noise_root(levels)
+        sizes = np.repeat(levels.factors, 3) * np.repeat(np.sqrt(levels.common), 3)
+        H[:, :, COLOUR] = self.single * sizes
         R = half @ half.swapaxes(1, 2)
         return LinearModel(flow.F, flow.b, Q, flow.z, H, R, ~wrong, flow.m0, P0)
 

@@ -93,16 +93,17 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], con
           for (int i = 0; i < SEEN; ++i)
             for (int c = 0; c < SEEN; ++c) F[r][c] -= scan.Kt[i][r] * M[i][c];
       }
-      for (int kind = 0; kind < 2; ++kind)
+      for (int kind = 0; kind < 2; ++kind) {
+        double largest = 0;
+        for (const auto& row : F)
+          for (int c = 3 * kind; c < 3 * kind + 3; ++c) largest = std::max(largest, std::fabs(row[c]));
         for (const double size : sizes) {
-          double moved = 0;
-          for (const auto& row : F)
-            for (int c = 3 * kind; c < 3 * kind + 3; ++c) moved = std::max(moved, std::fabs(row[c]) * size * one_sigma[kind]);
-          if (!(moved <= most)) continue;
+          if (!(largest * size * one_sigma[kind] <= most)) continue;
           Candidate one;
           evidence(A, b, F, 3 * kind, size * one_sigma[kind], one);
           found.push_back(one);
         }
+      }
     }
   }
   std::memset(P, 0, DIM * DIM * sizeof(double));
